@@ -60,6 +60,7 @@ def explain(
     exchanges: Iterable[tuple[Hidden, Evidence]] = (),
     beyond: Hidden = frozenset(),
     sudden: Hidden = frozenset(),
+    begun: Hidden = frozenset(),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -76,6 +77,7 @@ def explain(
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
         sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
+        begun: Columns of parts of which another sensor is hidden already.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
@@ -100,7 +102,7 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     strongest = set(order[:3].tolist())
-    part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest))
+    part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest), begun)
     for preferred in (sudden, part, beyond):
         single = [column for column in single if column in preferred] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
@@ -166,8 +168,11 @@ def _changed_part(
     left: Callable[[Hidden], float],
     single: Sequence[int],
     parts: Iterable[Hidden],
+    begun: Hidden,
 ) -> Hidden:
     """Return the part that explains an alarm better than all single elements of others; empty if none does.
+
+    Without it more evidence may be left than without an element: the body has come where nothing was learned.
 
     Args:
         evidence: The evidence.
@@ -175,14 +180,18 @@ def _changed_part(
         left: Returns the largest of it.
         single: Columns that explain the alarm alone.
         parts: Parts of the body with several sensors.
+        begun: Columns of parts of which another sensor is hidden already; these need to explain it nearly as well.
     """
     for part in parts:
         rivals = [column for column in single if column not in part]
-        if left(part) >= min([EXPLAINED, *(left(frozenset({column})) for column in rivals)]):
+        best = max((float(evidence.strength[c]) for c in rivals), default=0.0)
+        least = min((left(frozenset({column})) for column in rivals), default=TOOL)
+        is_begun = part <= begun
+        if left(part) >= (TOOL if is_begun else least):
             continue
         first = max(part, key=lambda c: evidence.strength[c])
         others = float(without(frozenset({first})).strength[list(part - {first})].sum())
-        if evidence.strength[first] + others > max((evidence.strength[c] for c in rivals), default=0.0) + ALIKE:
+        if evidence.strength[first] + others > (CLOSE * best if is_begun else best + ALIKE):
             return part
     return frozenset()
 

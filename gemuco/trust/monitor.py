@@ -412,6 +412,7 @@ class TrustMonitor:
             self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
             self._relations.beyond(self._schema, self._recent.values()[-1]),
             (self._sudden(age) | self._recent.repeats.stuck) - hidden,
+            frozenset().union(*(part - hidden for part in self._parts if part & hidden)),
         )  # fmt: skip
 
     def _sudden(self, age: int) -> Hidden:

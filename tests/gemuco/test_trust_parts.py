@@ -103,3 +103,36 @@ def test_one_of_two_that_look_alike_needs_more_evidence_only() -> None:
     case = Case(Cause(frozenset({JOINT, OTHER}), "either", JOINT), 1, 1, 1)
     alone = Cause(frozenset({JOINT}), "element", JOINT)
     assert case.yields_to(alone, evidence(joint=10.0), [], frozenset())
+
+
+@pytest.mark.parametrize(
+    ("rest", "joint", "begun", "is_length"),
+    [
+        (0.7, 55.0, True, True),
+        (0.7, 55.0, False, False),
+        (0.9, 55.0, True, False),
+        (0.7, 70.0, True, False),
+    ],
+    ids=["nearly as well", "nothing of it is hidden", "too much is left", "it explains much less"],
+)
+def test_the_other_sensor_of_a_part_that_has_begun_to_lie_needs_to_explain_it_nearly_as_well(
+    rest: float, joint: float, begun: bool, is_length: bool
+) -> None:
+    whole, length = evidence(joint=joint, length=50.0), frozenset({LENGTH})
+
+    def without(hidden: frozenset[int]) -> Evidence:
+        share = 0.5 if JOINT in hidden else rest if LENGTH in hidden else 1.0
+        return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
+
+    result = explain(whole, without, (), (length,), frozenset(), begun=length if begun else frozenset())
+    assert result.columns == (length if is_length else {JOINT})
+
+
+def test_a_part_may_leave_more_evidence_if_no_single_element_explains_an_alarm() -> None:
+    whole = evidence(joint=90.0, length=80.0, tension=90.0)
+
+    def without(hidden: frozenset[int]) -> Evidence:
+        share = 0.8 if hidden == MUSCLE else 0.5 if hidden == {JOINT, TENSION} else 0.95
+        return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
+
+    assert explain(whole, without, (), (MUSCLE,), frozenset()).columns == MUSCLE, "a pair would leave less"
