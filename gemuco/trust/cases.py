@@ -39,7 +39,7 @@ class Case:
         is_hidden: Whether its elements are hidden.
         has_jumped: Whether an element has jumped away, and not yet back.
         is_plain: Whether an element jumped or was stuck, so that it certainly lied.
-        may_be_body: Whether not its sensors may be wrong, but the part of the body that they measure has changed: a
+        may_be_body: Whether the part of the body that its sensors measure may have changed, so that they are right: a
             wire that is cut contradicts the sensors of its neighbours too.
         kind: As in `Finding`.
         size: As in `Finding`.
@@ -77,17 +77,18 @@ class Case:
         self.is_plain |= has_jumped or is_stuck
         is_sensor = self.cause.is_exchange or is_noise or is_stuck
         strongest = frozenset(np.argsort(-evidence.strength)[:2].tolist())
-        self.may_be_body |= not is_sensor and any(columns | strongest <= part for part in parts)
+        is_body = self.cause.cause == "part" or any(columns | strongest <= part for part in parts)
+        self.may_be_body |= is_body and not is_sensor
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
 
     def changes(self, columns: Hidden, parts: Iterable[Hidden]) -> bool:
-        """Whether it may have changed the body that some columns measure, other than those of its own part."""
+        """Whether the body may be another one for some columns; a part that has changed is so for all others."""
         is_body = self.may_be_body and not any(self.cause.columns | columns <= part for part in parts)
         return is_body or self.cause.cause == "environment"
 
     def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden], beyond: Hidden) -> bool:
-        """Whether another element replaces it: one of its own, or one with much more evidence.
+        """Whether another element replaces it: one of those that look alike, or one with much more evidence.
 
         It is held against all sensors of its part of the body. If one of these jumped, or is beyond what was learned,
         or all are contradicted, another part does not replace it: a cut wire lets the arm go where its neighbours look

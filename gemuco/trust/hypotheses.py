@@ -129,6 +129,21 @@ def explain(
     return Cause(frozenset(), "body", lead)
 
 
+def remaining(parts: Iterable[Hidden], hidden: Hidden, wrong: Hidden) -> tuple[list[Hidden], Hidden]:
+    """Return what can be judged of the parts of the body, and the columns of those that have begun to lie.
+
+    A sensor that is missing, or hidden by an operator, says nothing of the other one of its part.
+
+    Args:
+        parts: Columns of each part.
+        hidden: Columns that are hidden or missing.
+        wrong: Those of them that were hidden because the others contradict them.
+    """
+    begun: Hidden = frozenset().union(*(part - hidden for part in parts if part & wrong))
+    rests = [part - hidden for part in parts]
+    return [rest for rest in rests if len(rest) > 1 or (rest and rest <= begun)], begun
+
+
 def _another_tool(
     evidence: Evidence,
     left: Callable[[Hidden], float],

@@ -13,7 +13,7 @@ from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
-from gemuco.trust.hypotheses import SEARCHED, Cause, explain
+from gemuco.trust.hypotheses import SEARCHED, Cause, explain, remaining
 from gemuco.trust.jumps import EARLIER
 from gemuco.trust.recent import Recent, View
 from gemuco.trust.relations import Relations
@@ -380,7 +380,7 @@ class TrustMonitor:
     def _close(self, case: Case) -> None:
         """End a case; one without a plain lie may have been a contact, and such errors are usual from now on."""
         self._cases.remove(case)
-        if case.cause.cause in ("element", "either", "all") and not case.is_plain:
+        if case.cause.cause in ("element", "either", "all", "part") and not case.is_plain:
             self._healthy.excuse(sorted(case.cause.columns), case.steps, case.is_hidden)
 
     def _describe(self, case: Case, hidden: Hidden, is_noise: bool = False) -> None:
@@ -404,7 +404,7 @@ class TrustMonitor:
         """Return the most likely cause of an alarm; of one that is not new, without other tools and exchanges."""
         assert self._relations is not None and self._schema is not None
         age = int(evidence.age.flat[evidence.strength.argmax()])
-        parts = [part - hidden for part in self._parts if part - hidden]
+        parts, begun = remaining(self._parts, hidden, self._hidden_by_cases() & hidden)
         return explain(
             evidence, self._without(hidden, age), self._joined, parts,
             self._environment - hidden if is_new else frozenset(),
@@ -412,7 +412,7 @@ class TrustMonitor:
             self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
             self._relations.beyond(self._schema, self._recent.values()[-1]),
             (self._sudden(age) | self._recent.repeats.stuck) - hidden,
-            frozenset().union(*(part - hidden for part in self._parts if part & hidden)),
+            begun,
         )  # fmt: skip
 
     def _sudden(self, age: int) -> Hidden:
@@ -433,7 +433,10 @@ class TrustMonitor:
 
     def _hidden_columns(self) -> Hidden:
         by_hand = {self._place[p] for p in self._by_hand if p in self._place}
-        return frozenset(by_hand).union(*(case.cause.columns for case in self._cases if case.is_hidden))
+        return self._hidden_by_cases() | by_hand
+
+    def _hidden_by_cases(self) -> Hidden:
+        return frozenset().union(*(case.cause.columns for case in self._cases if case.is_hidden))
 
     def _at(self, case: Case) -> frozenset[int]:
         """Return the positions in the layout of a case's elements, without p."""

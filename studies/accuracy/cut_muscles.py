@@ -49,7 +49,7 @@ def play(schema: BodySchema, rows: dict[str, np.ndarray]) -> list[tuple[float, s
     for number in range(len(samples) // PART):
         monitor.add(samples[number * PART : (number + 1) * PART], number / 10.0)
         if monitor.hidden != before:
-            before, time = monitor.hidden, (number + 1) / 10.0 - BEFORE
+            before, time = monitor.hidden, round((number + 1) / 10.0 - BEFORE, 1)
             result.append((time, {schema.layout.element(element) for element in before}))
     return [(time, names) for time, names in result if time > 0.0]
 

@@ -11,10 +11,11 @@ from gemuco.dataset import as_dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
+from gemuco.trust.cases import Case
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, TrustConfig
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import explain
+from gemuco.trust.hypotheses import Cause, explain
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.relations import Relations, learned_range, rows_of
 from gemuco.trust.sensitivity import Sensitivity
@@ -264,6 +265,18 @@ def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm
     assert [(finding.kind, finding.cause) for finding in monitor.findings] == [("swapped", "all")]
     _, hidden = watch(model, samples[240:], monitor)
     assert not hidden[-1]
+
+
+def test_a_part_that_was_hidden_returns_when_it_agrees_and_the_next_one_needs_more_evidence(model, arm):
+    samples = move(arm, 240, 31)
+    monitor, _ = watch(model, samples[:150])
+    assert monitor._healthy.caution == 0.0
+    part = Cause(frozenset({TENSION, LENGTH}), "part", LENGTH)
+    monitor._cases.append(Case(part, 150, 150, 150, steps=np.zeros(12), is_hidden=True))
+    _, hidden = watch(model, samples[150:], monitor)
+    assert hidden[0] == {TENSION, LENGTH}
+    assert not hidden[-1]
+    assert monitor._healthy.caution > 1.0, "it agreed again by itself, and was perhaps right"
 
 
 def test_while_a_muscle_may_have_changed_other_sensors_are_accused_later(model, arm):

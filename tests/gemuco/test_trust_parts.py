@@ -7,7 +7,7 @@ import pytest
 
 from gemuco.trust.cases import Case
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import Cause, explain
+from gemuco.trust.hypotheses import Cause, explain, remaining
 
 SIZE, JOINT, TENSION, LENGTH, OTHER = 12, 0, 3, 8, 9
 MUSCLE = frozenset({TENSION, LENGTH})
@@ -136,3 +136,35 @@ def test_a_part_may_leave_more_evidence_if_no_single_element_explains_an_alarm()
         return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
 
     assert explain(whole, without, (), (MUSCLE,), frozenset()).columns == MUSCLE, "a pair would leave less"
+
+
+@pytest.mark.parametrize(
+    ("hidden", "wrong", "parts", "begun"),
+    [
+        (set(), set(), [MUSCLE, {5, 6, 7}], set()),
+        ({TENSION}, {TENSION}, [{LENGTH}, {5, 6, 7}], {LENGTH}),
+        ({TENSION}, set(), [{5, 6, 7}], set()),
+        ({5}, set(), [MUSCLE, {6, 7}], set()),
+        ({TENSION, 5}, {5}, [{6, 7}], {6, 7}),
+        (set(MUSCLE), set(MUSCLE), [{5, 6, 7}], set()),
+    ],
+    ids=[
+        "all judged",
+        "the tension lies",
+        "the tension is missing",
+        "one of three is",
+        "one lies, one is missing",
+        "both",
+    ],
+)
+def test_a_sensor_that_is_missing_does_not_accuse_the_other_of_its_part(
+    hidden: set[int], wrong: set[int], parts: list[set[int]], begun: set[int]
+) -> None:
+    every = [MUSCLE, frozenset({5, 6, 7})]
+    assert remaining(every, frozenset(hidden), frozenset(wrong)) == (parts, begun)
+
+
+def test_a_part_that_has_changed_leaves_the_body_unknown_also_if_a_joint_is_contradicted_more() -> None:
+    case = Case(Cause(MUSCLE, "part", LENGTH), 1, 1, 1)
+    case.weigh(evidence(joint=85.0, length=90.0, tension=20.0), frozenset(), frozenset(), [MUSCLE])
+    assert case.changes(frozenset({JOINT}), [MUSCLE])
