@@ -21,6 +21,8 @@ STEADY = 0.3
 """An event is noticed when it is reported for this long [s]: on a busy machine one late message looks like it."""
 AGAIN = 0.05
 """Before a request is repeated the client receives samples for this time [s]."""
+LONGEST_STEP = 0.1
+"""A wait counts at most this time [s] per look at its condition; the rest of a stall of the machine does not count."""
 TRIES = 3
 """A target is sent at most this often if the HAL stops the robot before the end."""
 
@@ -109,13 +111,15 @@ class Actor:
         self._insist(lambda: self._client.fault(text, service))
 
     def wait(self, condition: Callable[[], bool], duration: float) -> bool:
-        """Wait until the condition is true, at most `duration` [s]; return whether it became true."""
-        deadline = time.monotonic() + duration
+        """Wait until the condition is true, at most `duration` [s] without stalls; return whether it became true."""
+        left, looked = duration, time.monotonic()
         while not condition():
-            if time.monotonic() >= deadline:
+            if left <= 0:
                 return False
             self._idle()
             time.sleep(0.01)
+            now = time.monotonic()
+            left, looked = left - min(now - looked, LONGEST_STEP), now
         return True
 
     def notice(self, is_reported: Callable[[], bool]) -> tuple[bool, float]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from gemuco.compiled.blas import cores
 from gemuco.warm import warm
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
@@ -77,7 +78,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
     report.show(ending, out, console)
     report.write(ending, path, seed, picture)
     if ending.rate != ending.wanted:
-        console.print(f"Played at {ending.rate:g} Hz, because this machine did not keep {ending.wanted:g} Hz.")
+        console.print(f"Played at {ending.rate:g} Hz, because this machine is too slow for {ending.wanted:g} Hz.")
     console.print(f"{time.monotonic() - started:.0f} s in all.")
     return 0 if ending.is_observed else 1
 
@@ -105,9 +106,15 @@ class Cast:
 def running(
     robot: RobotConfig, path: Path, seed: int, target: str, out: Path, supervisor: Supervisor, console: Console
 ) -> Iterator[Cast]:
-    """Start the processes; if this machine does not keep their rate, restart them at half of it, at most twice."""
-    rates = robot.rates
-    for halvings_left in reversed(range(pace.HALVINGS + 1)):
+    """Start the processes at a rate for this machine; if it is not kept, restart them at half of it."""
+    tried = pace.rates_to_try(robot.rates)
+    if tried[0] != robot.rates:
+        console.print(
+            f"The story is played at {tried[0].hal:g} Hz: {robot.rates.hal:g} Hz would keep all {cores()} processor "
+            "cores busy."
+        )
+    for rates in tried:
+        is_last = rates is tried[-1]
         recording = out / "story.mcap"
         recording.unlink(missing_ok=True)
         with pace.at_rates(path, robot, rates) as file, Client(robot.robot) as client:
@@ -124,8 +131,8 @@ def running(
             with waiting(console, f"counting whether this machine keeps {rates.hal:g} Hz"):
                 counts = pace.count_cycles(client, actor.wait)
             if not counts.is_kept:
-                console.print(too_slow(counts, halvings_left))
-            if counts.is_kept or not halvings_left:
+                console.print(too_slow(counts, is_last))
+            if counts.is_kept or is_last:
                 try:
                     yield Cast(load_robot(file), client, actor, remote, screen)
                 except ServiceUnavailable:
@@ -133,15 +140,14 @@ def running(
                     raise
                 return
             supervisor.stop_all()
-        rates = pace.halved(rates)
 
 
-def too_slow(counts: CycleCounts, halvings_left: int) -> str:
+def too_slow(counts: CycleCounts, is_last: bool) -> str:
     """Return sentences on a rate that is not kept, and on the consequence."""
     consequence = (
-        f"All processes are started again at {counts.rate / 2:g} Hz."
-        if halvings_left
-        else "The story is played in spite of this, and the HAL may stop the robot."
+        "The story is played in spite of this, and the HAL may stop the robot."
+        if is_last
+        else f"All processes are started again at {counts.rate / 2:g} Hz."
     )
     return f"[yellow]This machine does not keep {counts.rate:g} Hz: {counts}. {consequence}[/]"
 

@@ -1,4 +1,4 @@
-"""Check that this machine keeps the rate of a robot file; otherwise make a robot file with half the rate."""
+"""Choose a rate that this machine keeps with time to spare, and make a robot file with it."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from gemuco.compiled.blas import cores
 from hal.config import RatesConfig, RobotConfig
 from services.client import Client
 from services.errors import ServiceError
@@ -21,6 +22,9 @@ MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
 tolerate a few missed cycles; a machine that is fast enough misses none."""
 HALVINGS = 2
 """The rate is halved at most this often: commands need at least a quarter of 200 Hz."""
+FEW_CORES = 2
+"""With at most this many processor cores the story begins at half the rate: at 200 Hz the muscle-driven
+arm takes 1.7 cores, so that every stall of the machine would stop the robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +93,14 @@ def _newest(client: Client) -> Status:
     if status is None:
         raise ServiceError("The HAL publishes no status any more; see the logs.")
     return status
+
+
+def rates_to_try(rates: RatesConfig) -> list[RatesConfig]:
+    """Return the rates of the robot file, halves and quarters of them; on a machine of few cores without the first."""
+    tried = [rates]
+    for _ in range(HALVINGS):
+        tried.append(halved(tried[-1]))
+    return tried[1:] if cores() <= FEW_CORES else tried
 
 
 def halved(rates: RatesConfig) -> RatesConfig:

@@ -48,7 +48,7 @@ LIES = (("elbow_pitch", "sensor_offset elbow_pitch_encoder 1.0", "one radian off
 """Elements whose encoders lie, the faults, and the lies in words."""
 LYING_POSES = 2
 TRUE_POSES = 6
-"""A lying encoder is trusted again within this number of poses."""
+"""A lying encoder is trusted again within this number of poses to which the arm went without being stopped."""
 WRONG, LEAKS_AFTER = 0.1, 2.0
 """A value is wrong from this error on [rad]; this time [s] after the first one none may be passed on as measured."""
 NAMES = ("moves to targets", "loses an encoder", "learns its own body", "has encoders that lie", "loses a muscle")
@@ -179,10 +179,13 @@ class Story:
             reason = self._reason(element) or reason
         self._actor.fault(f"sensor_true {element}_encoder")
         end = self._timeline.now()
-        for _ in range(TRUE_POSES):
-            if not self._is_estimated(index):
+        reached = 0
+        for _ in range(MOST_POSES):
+            if not self._is_estimated(index) or reached == TRUE_POSES:
                 break
+            stops = self._actor.stops
             self._go(self._pose(), LEARNING_TIME)
+            reached += self._actor.stops == stops
         returned = self._timeline.now() - end
         at, hidden = (self._timeline.between(name, start, end) for name in ("time", "estimated"))
         hidden = hidden[:, index] > 0

@@ -112,8 +112,9 @@ def test_what_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, arm: Pa
 class Processes:
     """Stands for the supervisor and all that it starts; keeps the highest rate that it is told to."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, highest: float) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, highest: float, cores: int = 4) -> None:
         self.highest, self.rates, self.stopped = highest, [], 0
+        monkeypatch.setattr(pace, "cores", lambda: cores)
         monkeypatch.setattr(demo, "start", self._start)
         monkeypatch.setattr(demo, "Client", self._client)
         monkeypatch.setattr(pace, "count_cycles", self._look)
@@ -137,18 +138,21 @@ class Processes:
 
 
 @pytest.mark.parametrize(
-    ("highest", "rates", "sentences"),
+    ("cores", "highest", "rates", "sentences"),
     [
-        (200, [200], []),
-        (100, [200, 100], ["keep 200 Hz: 100 of 800", "again at 100 Hz"]),
-        (50, [200, 100, 50], ["again at 100 Hz", "again at 50 Hz"]),
-        (10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played in spite of this"]),
+        (4, 200, [200], []),
+        (4, 100, [200, 100], ["keep 200 Hz: 100 of 800", "again at 100 Hz"]),
+        (4, 50, [200, 100, 50], ["again at 100 Hz", "again at 50 Hz"]),
+        (4, 10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played in spite of this"]),
+        (2, 200, [100], ["played at 100 Hz: 200 Hz would keep all 2 processor cores busy"]),
+        (1, 50, [100, 50], ["played at 100 Hz", "again at 50 Hz"]),
+        (2, 10, [100, 50], ["played at 100 Hz", "again at 50 Hz", "played in spite of this"]),
     ],
 )
 def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
-    monkeypatch: pytest.MonkeyPatch, arm: Path, highest: float, rates: list[float], sentences: list[str]
+    monkeypatch: pytest.MonkeyPatch, arm: Path, cores: int, highest: float, rates: list[float], sentences: list[str]
 ) -> None:
-    processes, console = Processes(monkeypatch, highest), Console(record=True, width=300)
+    processes, console = Processes(monkeypatch, highest, cores), Console(record=True, width=300)
     robot = load_robot(arm)
     with demo.running(robot, arm, 1, "joint_position", arm.parent, processes, console) as cast:  # type: ignore[arg-type]
         assert cast.robot.rates.hal == rates[-1]

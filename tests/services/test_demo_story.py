@@ -14,7 +14,17 @@ from services.demo import actor as actor_module
 from services.demo import story as story_module
 from services.demo.actor import NOTICED_WITHIN, REACHED_WITHIN, TRIES, Actor
 from services.demo.arm_story import ArmStory
-from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, POSE_TIME, Story, leaks
+from services.demo.story import (
+    CALM_TRIES,
+    LEARNED,
+    LEARNING_POSES,
+    MOST_POSES,
+    NORMAL,
+    POSE_TIME,
+    TRUE_POSES,
+    Story,
+    leaks,
+)
 from services.errors import ServiceError, ServiceUnavailable, TooLate, TooSlow
 from services.wire.messages import Applied, Status, Update
 
@@ -26,7 +36,7 @@ class Machine:
 
     def __init__(self, per_pose: int, false_alarms: int = 0) -> None:
         self.per_pose, self.alarms_left = per_pose, false_alarms
-        self.window = self.poses = 0
+        self.window = self.poses = self.stops = 0
         self.said: list[str] = []
         self.normals: list[int] = []
 
@@ -123,6 +133,32 @@ def test_a_lie_is_passed_on_only_where_a_value_is(
     assert words in text
     assert seen == is_seen
     assert "nan" not in text
+
+
+@pytest.mark.parametrize(("stopped", "poses"), [(0, TRUE_POSES), (5, TRUE_POSES + 5), (MOST_POSES, MOST_POSES)])
+def test_poses_to_which_the_arm_was_stopped_do_not_count(
+    monkeypatch: pytest.MonkeyPatch, stopped: int, poses: int
+) -> None:
+    machine = Lie("mmeeee")
+    story, right = machine.story(), []
+
+    def go(signal: str, pose: np.ndarray, duration: float) -> None:
+        machine.poses += 1
+        machine.stops += machine.poses <= stopped
+
+    def fault(text: str) -> None:
+        machine.poses = 0
+        right.append(text)
+
+    monkeypatch.setattr(machine, "go", go)
+    monkeypatch.setattr(machine, "fault", fault)
+    monkeypatch.setattr(story, "_reason", lambda element: "frozen")
+    monkeypatch.setattr(story, "_is_estimated", lambda index: True)
+    text, seen = story._lying("elbow_pitch", "sensor_frozen elbow_pitch_encoder", "frozen")
+    assert machine.poses == poses
+    assert right[-1] == "sensor_true elbow_pitch_encoder"
+    assert "not trusted again" in text
+    assert not seen
 
 
 class ManyJoints:
@@ -334,6 +370,22 @@ def test_an_event_is_noticed_when_its_report_stays(
     monkeypatch.setattr(actor_module, "time", reporting)
     noticed, delay = Actor(None, lambda: None, print).notice(reporting.is_reported)  # type: ignore[arg-type]
     assert (noticed, delay) == (expected[0], pytest.approx(expected[1], abs=0.02))
+
+
+@pytest.mark.parametrize(("stall", "ends"), [(0.0, 1.0), (0.05, 1.05), (5.0, 6.0)])
+def test_time_in_which_the_machine_stands_still_is_not_counted(
+    monkeypatch: pytest.MonkeyPatch, stall: float, ends: float
+) -> None:
+    clock = Reporting()
+    stalls = iter([stall])
+    monkeypatch.setattr(actor_module, "time", clock)
+
+    def idle() -> None:
+        if clock.now > 0.5:
+            clock.sleep(next(stalls, 0.0))
+
+    assert not Actor(None, idle, print).wait(lambda: False, 1.0)  # type: ignore[arg-type]
+    assert clock.now == pytest.approx(ends, abs=0.12)
 
 
 class Unreachable:
