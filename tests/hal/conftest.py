@@ -1,3 +1,6 @@
+import functools
+
+import dbc_wire
 import pytest
 from hal_bench import Bench
 from mit_bench import mit_bench
@@ -31,3 +34,9 @@ def open_mit():
     yield open_bench
     for bench in benches:
         bench.close()
+
+
+@pytest.fixture
+def open_wire(tmp_path):
+    """Returns the frames of a node with a DBC file; see `dbc_wire.open_wire`."""
+    return functools.partial(dbc_wire.open_wire, tmp_path)

@@ -4,10 +4,13 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hal_bench import ROBOTS, Bench
 
 from hal.calibration.units import axis_units
 from hal.config import RobotConfig
+from hal.errors import ConfigError
+from hal.robot import open_robot
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
 
 RATE = 200.0
@@ -23,7 +26,13 @@ ELBOW = {quantity: f"joint_{quantity}.elbow" for quantity in UNITS}
 CONSTANTS = DriveConstants(
     counts_per_turn=4096, gear=50.0, spool_radius=None, zero=-0.2, rated_torque=0.2, load="joint_load.elbow"
 )
+NODE = 5
 SETTINGS = {"eds": "eds/servo_drive.eds", "counts_per_turn": 4096, "gear": 50, "zero": -0.2}
+FIXED = {
+    "fixed": True,
+    "receives": [{"number": 1, "objects": ["6040h uint16", "607Ah int32"]}],
+    "sends": [{"number": 1, "objects": ["6041h uint16", "6064h int32", "6077h int16"]}],
+}
 TEMPERATURE = {"object": "2200h:1", "type": "int16", "scale": 0.1}
 HOMING = {"method": 17, "speed": 1.0, "slow_speed": 0.1}
 COMMANDED = {"profile_position": "position", "ip": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
@@ -100,3 +109,29 @@ class JointBench(Bench):
     def value(self, quantity):
         """The newest measured value."""
         return float(self.sample.values[f"joint_{quantity}"][0])
+
+
+def without(tmp_path, *indices):
+    """The drive's data sheet without some objects."""
+    kept, is_dropped = [], False
+    for line in (ROBOTS / SETTINGS["eds"]).read_text().splitlines():
+        if line.startswith("["):
+            is_dropped = any(line[1:].upper().startswith(index) for index in indices)
+        if not is_dropped:
+            kept.append(line)
+    path = tmp_path / "less.eds"
+    path.write_text("\n".join(kept))
+    return path
+
+
+def refused(mode="csp", sheet=None, node=NODE, quantities=("position",), **settings):
+    """What is said of a robot file before anything is opened."""
+    body = joint_description(mode, quantities, **settings)
+    if sheet is not None:
+        body["kinds"]["drive"]["settings"]["eds"] = str(sheet)
+    body["devices"]["elbow"]["node"] = node
+    with pytest.raises(ConfigError) as caught:
+        open_robot(RobotConfig.model_validate(body))
+    report = str(caught.value)
+    assert "'elbow'" in report
+    return report

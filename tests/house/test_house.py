@@ -13,6 +13,7 @@ from services.wire import keys
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gemuco", "hal", "simulators", "services", "studies")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
 ROBOTS = sorted(path for path in (ROOT / "robots").glob("*.yaml") if "." not in path.stem)
 LONGEST_FILE = 450
 MOST_MODULES = 16
@@ -26,7 +27,7 @@ def _name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("path", MODULES, ids=_name)
+@pytest.mark.parametrize("path", MODULES + TESTS, ids=_name)
 def test_file_can_be_read_in_one_sitting(path: Path) -> None:
     lines = path.read_text().splitlines()
     assert len(lines) <= LONGEST_FILE, f"{_name(path)} has {len(lines)} lines: split it by what it is about"

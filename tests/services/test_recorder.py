@@ -1,13 +1,7 @@
 import os
-import resource
-import shutil
-import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +11,13 @@ import pytest
 import zenoh
 from any_message import ARM, a_message
 from mcap.reader import make_reader
-from mcap.records import Channel
-from mcap.records import Message as McapMessage
+from recordings import eventually, log_lines, record_as, update_of, versions_of
 
 from services.errors import RecordingError
 from services.process.service import Service
 from services.recording import recorder
 from services.recording.losses import LOG, MOST_KEYS, OTHERS, Losses
-from services.recording.reading import _records, facts_of, losses, read
+from services.recording.reading import facts_of, losses, read
 from services.recording.recorder import EntryQueue, Recorder, run_recorder
 from services.recording.writer import UNREADABLE, Limits, RecordingWriter
 from services.wire import keys, messages
@@ -33,55 +26,16 @@ from services.wire.session import close_session, open_session
 from services.wire.streams import Publisher
 
 
-def _update(version: int) -> Update:
-    return Update(stamp_ns=version + 1, active=True, model_version=version, window=0, dropped=0, loss=0.0)
-
-
-def log_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of the log in a file that may still be written."""
-    records = list(_records(path))
-    logs = {record.id for record in records if isinstance(record, Channel) and record.topic.endswith("/recorder/log")}
-    return [
-        msgspec.json.decode(record.data)
-        for record in records
-        if isinstance(record, McapMessage) and record.channel_id in logs
-    ]
-
-
-def _eventually(happened: Callable[[], Any], within: float = 30.0) -> None:
-    deadline = time.monotonic() + within
-    while not happened():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-@pytest.fixture
-def session(robot: str) -> Iterator[zenoh.Session]:
-    opened = open_session(robot, "hal")
-    yield opened
-    close_session(opened)
-
-
-@contextmanager
-def _recording(session: zenoh.Session, robot: str, path: Path, limits: Limits | None = None) -> Iterator[Recorder]:
-    with recorder.recording(session, robot, path, ARM, "a tool", limits) as found:
-        yield found
-
-
-def _versions(*paths: Path) -> list[int]:
-    return [one.message.model_version for one in read(paths) if isinstance(one.message, Update)]
-
-
 def test_what_was_published_is_read_back_in_order(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "new" / "run.mcap"
     sample = a_message(Sample)
-    with _recording(session, robot, path) as found:
+    with record_as(session, robot, path) as found:
         updates = Publisher(session, keys.update(robot), Update, boot=3)
         for version in range(100):
-            updates.put(_update(version))
+            updates.put(update_of(version))
         session.put(keys.sample(robot), messages.encode(sample))
-        _eventually(lambda: found.writer.written == 101)
-    assert _versions(path) == list(range(100))
+        eventually(lambda: found.writer.written == 101)
+    assert versions_of(path) == list(range(100))
     (again,) = read(path, [keys.sample(robot)])
     assert messages.encode(again.message) == messages.encode(sample)
     assert losses(path) == {"dropped": 0, "missed": 0, "malformed": 0}
@@ -95,10 +49,10 @@ def test_any_tool_that_reads_mcap_finds_json_that_fits_its_schema(
 ) -> None:
     """The plain mcap library and a JSON Schema validator; nothing of ours."""
     path = tmp_path / "run.mcap"
-    with _recording(session, robot, path) as found:
+    with record_as(session, robot, path) as found:
         for record, key in ((Sample, keys.sample(robot)), (Update, keys.update(robot)), (Holder, keys.holder(robot))):
             session.put(key, messages.encode(a_message(record)))
-        _eventually(lambda: found.writer.written == 3)
+        eventually(lambda: found.writer.written == 3)
     seen = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -120,12 +74,12 @@ def test_unknown_keys_and_bytes_that_are_no_message_are_kept_and_counted(
     robot: str, session: zenoh.Session, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
-    with _recording(session, robot, path) as found:
+    with record_as(session, robot, path) as found:
         session.put(keys.robot_key(robot, "gripper", "note"), b'{"grip": 1}', encoding="application/json")
         session.put(keys.robot_key(robot, "gripper", "image"), b"\x89PNG", encoding="image/png")
         session.put(keys.sample(robot), b"no message of ours")
         session.put(keys.update(robot), messages.encode(a_message(Sample)))
-        _eventually(lambda: found.writer.written == 4)
+        eventually(lambda: found.writer.written == 4)
         assert found.counters()["foreign"] == 2
     kept = {}
     with path.open("rb") as stream:
@@ -148,14 +102,14 @@ def test_unknown_keys_and_bytes_that_are_no_message_are_kept_and_counted(
 @pytest.mark.long
 def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with _recording(session, robot, path) as found:
+    with record_as(session, robot, path) as found:
         token = session.liveliness().declare_token(keys.alive(robot, "model"))
-        _eventually(lambda: found.writer.size)
+        eventually(lambda: found.writer.size)
         for name in ("anna", "anna", "", "ben"):
             session.put(keys.holder(robot), messages.encode(Holder(name=name, holder=1)))
-        _eventually(lambda: found.writer.written == 4)
+        eventually(lambda: found.writer.written == 4)
         token.undeclare()
-        _eventually(lambda: [line for line in log_lines(path) if line["kind"] == "gone"])
+        eventually(lambda: [line for line in log_lines(path) if line["kind"] == "gone"])
     said = [line["message"] for line in log_lines(path) if line["kind"] in ("alive", "gone", "holder")]
     assert said == [
         "The 'model' service started.", "anna commands the robot.", "No client commands the robot.",
@@ -170,11 +124,11 @@ def test_the_hal_tells_what_elements_are_called(robot: str, tmp_path: Path) -> N
         client = open_session(robot, "recorder")
         with recorder.recording(client, robot, path) as found:
             samples = Publisher(hal.session, keys.sample(robot), Sample, 1)
-            _eventually(lambda: samples.has_listener)
+            eventually(lambda: samples.has_listener)
             sample = a_message(Sample)
             assert isinstance(sample, Sample)
             samples.put(sample)
-            _eventually(lambda: found.writer.written >= 1)
+            eventually(lambda: found.writer.written >= 1)
         close_session(client)
     (facts,) = facts_of(path)
     assert facts.described["rates"] == {"hal": 200.0}
@@ -190,7 +144,7 @@ def test_without_anybody_who_names_them_elements_have_numbers(
     path = tmp_path / "run.mcap"
     with recorder.recording(session, robot, path) as found:
         session.put(keys.sample(robot), messages.encode(a_message(Sample)))
-        _eventually(lambda: found.writer.written == 1)
+        eventually(lambda: found.writer.written == 1)
     (one,) = read(path, [keys.sample(robot)])
     assert one.form.catalogue.signals["joint_position"].elements == ("element_1", "element_2")
 
@@ -213,14 +167,14 @@ def test_losses_are_counted_and_written_into_the_file(robot: str, session: zenoh
     path = tmp_path / "run.mcap"
     writer = StalledDisk(path, robot, ARM)
     with Recorder(session, robot, writer, limit=4) as found:
-        session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=3))
+        session.put(keys.update(robot), messages.encode(update_of(0), seq=0, boot=3))
         assert writer.stands.wait(20.0)
         for seq in (1, 5, 6, 7, 8, 9):
-            session.put(keys.update(robot), messages.encode(_update(seq), seq=seq, boot=3))
+            session.put(keys.update(robot), messages.encode(update_of(seq), seq=seq, boot=3))
         writer.goes_on.set()
-        _eventually(lambda: writer.written == 5)
-        session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=4))
-        _eventually(lambda: writer.written == 6)
+        eventually(lambda: writer.written == 5)
+        session.put(keys.update(robot), messages.encode(update_of(0), seq=0, boot=4))
+        eventually(lambda: writer.written == 6)
     assert [entry.message.seq for entry in read(path)] == [0, 1, 5, 6, 7, 0]
     assert losses(path) == {"dropped": 2, "missed": 3, "malformed": 0}
     report = {line["kind"]: (line["key"], line["count"]) for line in log_lines(path) if "count" in line}
@@ -255,24 +209,24 @@ def test_a_new_file_begins_when_one_is_big_or_long_and_nothing_is_lost_or_double
     writer.open(0)
     for number in range(100):
         now = number * second // 10
-        writer.add(keys.update(robot), now, messages.encode(_update(number), seq=number))
+        writer.add(keys.update(robot), now, messages.encode(update_of(number), seq=number))
         if number % 7 == 0:
             writer.commit(now)
     writer.finish(10 * second)
     files = sorted(tmp_path.iterdir())
     assert [file.name for file in files] == [f"run-00000{number}.mcap" for number in range(1, 6)]
-    assert [len(_versions(file)) for file in files] == [20] * 5
-    assert _versions(*reversed(files)) == list(range(100))
+    assert [len(versions_of(file)) for file in files] == [20] * 5
+    assert versions_of(*reversed(files)) == list(range(100))
     assert losses(files)["missed"] == 0
     assert [facts.part for facts in facts_of(files)] == [1, 2, 3, 4, 5]
     again = RecordingWriter(path, robot, ARM, "", Limits(max_bytes=4000))
     again.open(0)
     for number in range(200):
-        again.add(keys.update(robot), number, messages.encode(_update(number), seq=number, boot=number % 50))
+        again.add(keys.update(robot), number, messages.encode(update_of(number), seq=number, boot=number % 50))
         again.commit(number)
     again.finish(200)
     assert again.paths[0].name == "run-000006.mcap"
-    assert len(again.paths) > 2 and _versions(*again.paths) == list(range(200))
+    assert len(again.paths) > 2 and versions_of(*again.paths) == list(range(200))
     assert all(file.stat().st_size >= 4000 for file in again.paths[:-1])
 
 
@@ -289,10 +243,10 @@ def test_a_recording_without_limits_begins_a_new_file_every_hour(robot: str, tmp
     writer = RecordingWriter(tmp_path / "run.mcap", robot, ARM)
     writer.open(0)
     for number in range(3):
-        writer.add(keys.update(robot), number * 1800 * 10**9, messages.encode(_update(number), seq=number))
+        writer.add(keys.update(robot), number * 1800 * 10**9, messages.encode(update_of(number), seq=number))
     writer.finish(3600 * 10**9)
     assert [path.name for path in writer.paths] == ["run.mcap", "run-000002.mcap"]
-    assert _versions(*writer.paths) == [0, 1, 2]
+    assert versions_of(*writer.paths) == [0, 1, 2]
 
 
 @pytest.mark.long
@@ -324,120 +278,6 @@ def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
         list(read(tmp_path / "nowhere.mcap"))
     with pytest.raises(RecordingError, match="No recording was named"):
         list(read([]))
-
-
-_RECORD = (
-    "import sys; from services.recording.recorder import run_recorder; sys.exit(run_recorder(sys.argv[1], sys.argv[2]))"
-)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_recording_is_readable_however_its_process_ends(
-    robot: str, session: zenoh.Session, tmp_path: Path, end: signal.Signals
-) -> None:
-    """After kill -9 only the newest part, at most a second, may be missing."""
-    path = tmp_path / "run.mcap"
-    updates = Publisher(session, keys.update(robot), Update, boot=3)
-    process = subprocess.Popen([sys.executable, "-c", _RECORD, robot, str(path)])
-    try:
-        _eventually(lambda: updates.has_listener)
-        for version in range(150):
-            updates.put(_update(version))
-        _eventually(lambda: path.exists() and len(_try(lambda: _versions(path))) == 150)
-        process.send_signal(end)
-        assert process.wait(20.0) == (-signal.SIGKILL if end is signal.SIGKILL else 0)
-    finally:
-        process.kill()
-        process.wait()
-    assert _versions(path) == list(range(150))
-    assert facts_of(path)[0].is_whole == (end is not signal.SIGKILL)
-
-
-def _try(reading: Callable[[], list[int]]) -> list[int]:
-    try:
-        return reading()
-    except RecordingError:  # nothing is safe yet
-        return []
-
-
-def test_a_full_disk_ends_the_file_and_a_new_one_begins_when_there_is_space(
-    robot: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """The least space that is left free is moved instead of the disk being filled."""
-    free = shutil.disk_usage(tmp_path).free
-    path = tmp_path / "run.mcap"
-    writer = RecordingWriter(path, robot, ARM, "", Limits(least_free=free // 4))
-    writer.open(0)
-    writer.add(keys.update(robot), 0, messages.encode(_update(0), seq=0))
-    writer._limits = Limits(least_free=2 * free)
-    writer.commit(1)
-    assert "Nothing is recorded: the disk of" in writer.failure and writer.failure in caplog.text
-    assert facts_of(path)[0].is_whole and _versions(path) == [0]
-    for number in range(1, 5):
-        writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number))
-        writer.commit(number)
-    assert writer.losses.totals()["dropped"] == 4
-    writer._limits, writer._retry_at = Limits(least_free=free // 4), 0.0
-    writer.add(keys.update(robot), 5, messages.encode(_update(5), seq=5))
-    writer.finish(6)
-    assert writer.failure == ""
-    assert _versions(*writer.paths) == [0, 5]
-    assert losses(writer.paths)["dropped"] == 4
-    said = [line["message"] for line in log_lines(writer.paths[1])]
-    assert any("Before this file: Nothing is recorded" in text for text in said)
-
-
-def _limited(robot: str, folder: str) -> None:
-    """In a process of its own: files may have 20 kB, as on a full disk; prints what is left of it."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-    writer = RecordingWriter(Path(folder) / "run.mcap", robot, ARM, "", Limits())
-    writer.open(0)
-    for number in range(900):
-        writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number, boot=number % 8 + 1))
-        writer._retry_at = 0.0
-        if number % 50 == 0:
-            writer.commit(number)
-    writer.finish(900)
-    print(writer.written, writer.losses.totals()["dropped"])
-
-
-def test_a_file_that_can_be_written_no_further_stays_readable(robot: str, tmp_path: Path) -> None:
-    code = f"from test_recorder import _limited; _limited({robot!r}, {str(tmp_path)!r})"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60
-    )
-    written, dropped = map(int, done.stdout.split())
-    assert written + dropped == 900 and written > 0 and dropped > 0, done.stderr
-    assert "File too large" in done.stderr
-    files = sorted(tmp_path.iterdir())
-    assert len(files) > 1 and all(file.stat().st_size <= 20_000 for file in files)
-    found = _versions(*files)
-    assert len(found) == written and found == sorted(set(found))
-
-
-def test_a_damaged_part_is_left_out_and_the_rest_is_read(
-    robot: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "run.mcap"
-    writer = RecordingWriter(path, robot, ARM)
-    writer.open(0)
-    sizes = []
-    for number in range(30):
-        writer.add(keys.update(robot), number + 1, messages.encode(_update(number), seq=number))
-        if number % 10 == 9:
-            writer.commit(number + 1)
-            sizes.append(writer.size)
-    writer.finish(40)
-    data = bytearray(path.read_bytes())
-    middle = (sizes[0] + sizes[1]) // 2 - 60
-    data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
-    path.write_bytes(data)
-    assert _versions(path) == [*range(10), *range(20, 30)]
-    assert "is damaged" in caplog.text
-    for length in range(0, len(data), 97):
-        (tmp_path / "cut.mcap").write_bytes(data[:length])
-        assert set(_try(lambda: _versions(tmp_path / "cut.mcap"))) <= set(range(30))
 
 
 @pytest.mark.long
