@@ -6,7 +6,7 @@ PLAYS := .venv/plays
 PACKAGES := .venv/packages
 STAMP := .venv/installed
 MODEL := tests/gemuco tests/house
-CLOCKLESS := $(addprefix tests/hal/test_,campaign.py fuzz.py object_tables.py safety_limits.py safety_motion.py safety_numbers.py) \
+CLOCKLESS := $(addprefix tests/hal/test_,campaign.py fuzz.py object_tables.py safety_limits.py safety_motion.py safety_numbers.py emergency_numbers.py) \
   $(addprefix tests/services/test_,acquaintance.py collector.py describe.py inspect.py lerobot.py measured.py message_logs.py recording_dataset.py \
     recording_schema.py trainer.py trust_loop.py update_loop.py view_state.py) \
   $(addprefix tests/simulators/test_,bullet.py drafted_robot.py eds.py kxr_world.py mjcf.py musashi_geometry.py musashi_motion.py physics.py \
