@@ -1,7 +1,6 @@
 """The command line of gemuco: all verbs."""
 
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +32,8 @@ Variant = Annotated[
 
 def _version(is_given: bool) -> None:
     if is_given:
+        from importlib import metadata
+
         typer.echo(f"gemuco {metadata.version('gemuco')}")
         raise typer.Exit
 

@@ -4,15 +4,9 @@ import shlex
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from gemuco.writing import replace, writing
-from services import show
 from services.errors import ServiceError
-from services.measured.draft import Draft, draft
 from services.verbs.verb import report_errors
 
 
@@ -37,6 +31,11 @@ def describe(
     `gemuco train` accepts the draft as it is. Write the units that are marked in it, and check the signals. Files of
     one call are episodes of one recording; a folder of files with different columns is one episode.
     """
+    from gemuco.writing import replace, writing
+    from services import show
+    from services.measured.draft import draft
+    from services.measured.draft_table import show_draft
+
     result = draft(files)
     path = out or Path(f"{result.name}.yaml")
     if path.exists():
@@ -45,7 +44,7 @@ def describe(
     is_below = folder.is_relative_to(here)
     with writing("The description", path):
         replace(path, result.text(here if is_below else None).encode())
-    _show(result, show.console())
+    show_draft(result, show.console())
     typer.echo(f"Written to {path}.")
     if result.unknown:
         typer.echo(f"Units are not known of {', '.join(result.unknown)}: write them where {path} marks it.")
@@ -77,44 +76,3 @@ def inspect(
     from services.verbs.inspect import run_inspection
 
     run_inspection(file, data, model, rate, out)
-
-
-def _show(result: Draft, console: Console) -> None:
-    """Print signals, time and faults."""
-    recording, clock = result.recording, result.clock
-    table = Table()
-    for title in ("signal", "elements", "unit in the file", "smallest", "largest", "not measured", "never vary"):
-        table.add_column(title, justify="left" if title in ("signal", "unit in the file") else "right")
-    for group in result.groups:
-        values = np.concatenate([column.values for column in group.columns])
-        dead = sum(column.is_dead for column in group.columns)
-        unit = "?" if group.unit is None else f"{group.unit} (guess)" if group.is_guess else group.unit
-        limits = (f"{np.nanmin(values):.4g}", f"{np.nanmax(values):.4g}")
-        table.add_row(
-            group.name, str(len(group.columns)), unit, *limits, f"{np.isnan(values).mean():.1%}", str(dead or "")
-        )
-    console.print(table)
-    count = len(recording.episodes)
-    lines = [f"{recording.rows} rows in {count} {'file or folder' if count == 1 else 'files or folders'}."]
-    if clock is None:
-        lines.append(
-            "No column is the time, so every file is one episode."
-            if result.episode is None
-            else "No column is the time."
-        )
-    else:
-        lines.append(
-            f"Time: {clock.column.label} in {clock.unit}, {clock.rate:.4g} rows per second; the longest step is "
-            f"{clock.longest:.3g} s, {clock.pauses} are longer than {clock.gap:g} s, {clock.back} go back, "
-            f"{clock.repeated} are 0."
-        )
-    if result.episode is not None:
-        lines.append(f"Episodes by {result.episode.label}.")
-    if (alignment := result.alignment) is not None:
-        lines.append(f"As {alignment.reason}, all are interpolated at {alignment.rate:g} Hz.")
-    if result.every > 1:
-        lines.append(
-            f"One of {result.every} rows is used, so that the first training is short; the draft says how to use all."
-        )
-    for line in lines + result.omissions + recording.notes:
-        console.print(line, highlight=False, markup=False)
