@@ -35,7 +35,7 @@ from services.model import artifacts
 from services.model.control_config import ControlConfig
 from services.model.living_model import load_model
 from services.model.model_config import model_config
-from services.process.supervisor import Supervisor, gemuco_command
+from services.process.supervisor import NotReady, Supervisor, gemuco_command
 from services.runtime import services_here
 from services.show import progress
 
@@ -322,9 +322,26 @@ def start(
 
 
 def await_ready(name: str, supervisor: Supervisor, client: Client, console: Console) -> None:
-    """Wait until a process publishes that it runs."""
+    """Wait until a process publishes that it runs.
+
+    Raises:
+        ChildDied: It ended.
+        NotReady: It was not ready in time; the message says what arrived of it.
+    """
     with waiting(console, f"starting {name}"):
-        supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+        try:
+            supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+        except NotReady as error:
+            raise NotReady(f"{error} {_seen_of(client, name)}") from None
+
+
+def _seen_of(client: Client, name: str) -> str:
+    """Return what arrives of a process, in a sentence."""
+    status, connected = client.status(name), "connected" if name in client.alive() else "not connected"
+    if status is None:
+        return f"It is {connected}, and no status arrives."
+    estimate = ", and no estimate arrives" if name == "model" and client.estimate() is None else ""
+    return f"It is {connected}{estimate}; its status is {status.state}. {status.text}".rstrip()
 
 
 def _is_running(client: Client, name: str) -> Callable[[], bool]:

@@ -15,7 +15,7 @@ from services.demo import demo, pace
 from services.demo.pace import CycleCounts, at_rates, count_cycles, halved
 from services.errors import ServiceError, ServiceUnavailable
 from services.model.artifacts import fingerprint
-from services.process.supervisor import ChildDied
+from services.process.supervisor import ChildDied, NotReady, Supervisor
 from services.wire.messages import Status
 
 ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
@@ -202,3 +202,32 @@ def test_a_model_that_suspects_a_sensor_of_an_unknown_body_runs(
             return object() if estimates else None
 
     assert demo._is_running(Publishing(), name)() == runs  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("state", "alive", "words"),
+    [
+        ("degraded", {"model"}, "It is connected, and no estimate arrives; its status is degraded. No sample."),
+        (None, set(), "It is not connected, and no status arrives."),
+        (None, {"model"}, "It is connected, and no status arrives."),
+    ],
+)
+def test_of_a_process_that_is_not_ready_the_error_says_what_arrives(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, state: str | None, alive: set[str], words: str
+) -> None:
+    class Client:
+        def status(self, service: str) -> Status | None:
+            return None if state is None else Status(service=service, state=state, text="No sample.")
+
+        def estimate(self) -> None:
+            return None
+
+        def alive(self) -> set[str]:
+            return alive
+
+    monkeypatch.setattr(demo, "READY_WITHIN", 0.1)
+    with Supervisor(tmp_path) as supervisor, pytest.raises(NotReady) as error:
+        supervisor.start("model", ["sleep", "30"])
+        demo.await_ready("model", supervisor, Client(), Console())  # type: ignore[arg-type]
+    assert str(error.value).endswith(words)
+    assert "model.log" in str(error.value)
