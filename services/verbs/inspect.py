@@ -4,17 +4,17 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import typer
 from rich.table import Table
 
-from gemuco import checkpoint
+from gemuco import checkpoint, writing
 from gemuco.errors import DatasetError
 from gemuco.signals import Layout
 from gemuco.trust.inspection import Inspection, Inspector, Lie
-from gemuco.writing import replace, writing
 from hal.errors import ConfigError
 from services import show
 from services.measured import description
@@ -48,23 +48,21 @@ def run_inspection(file: Path, data: Sequence[Path], model: Path | None, rate: f
     names = [name for part in parts for name in part.names]
     episodes = [episode for part in parts for episode in part.dataset.episodes]
     rate = rate or _rate(parts)
-    inspector, table, count, rows = Inspector(schema, rate), _table(), 0, 0
+    inspector, lies, rows = Inspector(schema, rate), _Lies(names), 0
     with show.progress("inspecting") as progress:
         for number, (name, episode) in enumerate(zip(names, episodes, strict=True)):
             progress(number / len(names), name)
             known = {signal: episode.values[signal] for signal in schema.layout.names if signal in episode.values}
             own = schema.under(episode.condition) if episode.condition in schema.biases else schema
             result = inspector.inspect(known, own)
-            for lie in result.lies:
-                table.add_row(*_line(name, lie, schema.layout))
-            count, rows = (
-                count + sum(lie.is_hidden for lie in result.lies),
-                rows + len(result.hidden[schema.layout.names[0]]),
-            )
+            length = len(result.hidden[schema.layout.names[0]])
+            lies.add(number, result.lies, length / rate)
+            rows += length
             if out is not None:
                 _write(out / f"{number:03d}_{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}.csv", result, schema.layout, rate)
-    if table.row_count:
-        show.console().print(table)
+    if lies.known:
+        show.console().print(lies.table(schema.layout))
+    count = sum(known.lie.is_hidden for known in lies.known)
     where = f"{counted(len(names), 'episode')}, {rows / rate / 60.0:.1f} min at {rate:g} rows per second"
     typer.echo(f"{counted(count, 'lie')} in {where}.")
     if out is not None:
@@ -96,23 +94,65 @@ def _rate(parts: Sequence[Timed]) -> float:
     return rates[0]
 
 
-def _table() -> Table:
-    table = Table("episode")
-    for head in ("from [s]", "to [s]"):
-        table.add_column(head, justify="right")
-    table.add_column("wrong")
-    table.add_column("kind")
-    table.add_column("error", justify="right")
-    table.add_column("used, because")
-    return table
+@dataclass(slots=True)
+class _Known:
+    """A lie, and the numbers of the episodes in which it begins and ends."""
+
+    lie: Lie
+    first: int
+    last: int
+
+
+class _Lies:
+    """The lies in successive episodes; one that goes on in the next episode of its table is one lie."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        """Take the table of every episode."""
+        self._names, self._length = names, 0.0
+        self.known: list[_Known] = []
+
+    def add(self, number: int, lies: Sequence[Lie], length: float) -> None:
+        """Add the lies in an episode of a length [s]."""
+        before = [known for known in self.known if known.last == number - 1 and known.lie.end >= self._length]
+        for lie in lies:
+            same = next((known for known in before if self._goes_on(known, lie, number)), None)
+            if same is None:
+                self.known.append(_Known(lie, number, number))
+            else:
+                same.lie, same.last = replace(same.lie, end=lie.end), number
+        self._length = length
+
+    def table(self, layout: Layout) -> Table:
+        """Return a row for each lie."""
+        table = Table("episode")
+        for head in ("from [s]", "to [s]"):
+            table.add_column(head, justify="right")
+        table.add_column("wrong")
+        table.add_column("kind")
+        table.add_column("error", justify="right")
+        table.add_column("used, because")
+        for known in self.known:
+            table.add_row(*_line(self._label(known), known.lie, layout))
+        return table
+
+    def _goes_on(self, known: _Known, lie: Lie, number: int) -> bool:
+        is_same = set(known.lie.elements) == set(lie.elements) and known.lie.is_hidden == lie.is_hidden
+        return is_same and lie.start == 0.0 and self._names[number] == self._names[known.last]
+
+    def _label(self, known: _Known) -> str:
+        name = self._names[known.first]
+        if self._names.count(name) == 1:
+            return name
+        last = "" if known.last == known.first else f" to {known.last}"
+        return f"{name}, {known.first}{last}"
 
 
 def _line(name: str, lie: Lie, layout: Layout) -> tuple[str, ...]:
-    """Return a row of the table."""
+    """Return a row of the table; of a table with several episodes `name` has their numbers."""
     what = {"environment": "another tool or load", "body": "the body, no sensor explains it"}.get(lie.cause)
     joined = {"either": " or ", "all": " and ", "part": " and "}.get(lie.cause, ", ").join(lie.elements)
     unit = layout.signal(lie.elements[0].partition(".")[0]).unit if lie.elements else ""
-    size = f"{lie.size:.3g} {unit}" if np.isfinite(lie.size) else ""
+    size = f"{lie.size:.3g} {'' if unit == '1' else unit}".rstrip() if np.isfinite(lie.size) else ""
     return name, f"{lie.start:.1f}", f"{lie.end:.1f}", what or joined, lie.kind, size, lie.reason
 
 
@@ -129,5 +169,5 @@ def _write(path: Path, result: Inspection, layout: Layout, rate: float) -> None:
         estimated = " ".join(name for name, is_wrong in zip(names, wrong, strict=True) if is_wrong)
         cells = (f"{value:.9g}" if np.isfinite(value) else "" for value in row)
         table.writerow([f"{number / rate:.6g}", *cells, estimated])
-    with writing("The inspected episode", path):
-        replace(path, text.getvalue().encode())
+    with writing.writing("The inspected episode", path):
+        writing.replace(path, text.getvalue().encode())

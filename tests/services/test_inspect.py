@@ -9,7 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from gemuco import TrainConfig, fit, save
+from gemuco.trust.inspection import Lie
 from services.cli import app
+from services.verbs.inspect import _Lies
 
 SECONDS, RATE, LIES_FROM, LIES_UNTIL = 40, 10, 15, 25
 UNITS = {"joint": "rad", "cable": "m", "tension": "N"}
@@ -127,3 +129,32 @@ def test_tables_of_different_rates_are_not_mixed(trained, tmp_path):
     code, text = run(trained, *words)
     assert code == 1
     assert "The tables have 5 to 10 rows per second" in text
+
+
+def a_lie(start, end, *elements, is_hidden=True):
+    return Lie(elements, "element", "frozen", start, end, 0.3, is_hidden, "")
+
+
+def test_a_lie_that_goes_on_in_the_next_episode_of_its_table_is_one():
+    lies = _Lies(["a.csv", "a.csv", "a.csv", "b.csv", "b.csv"])
+    lies.add(0, [a_lie(0.4, 1.0, "joint.0"), a_lie(0.1, 0.5, "joint.1")], 1.0)
+    lies.add(1, [a_lie(0.0, 2.0, "joint.0"), a_lie(0.0, 2.0, "joint.1")], 2.0)  # joint.1 was right in between
+    lies.add(2, [a_lie(0.0, 0.7, "joint.0"), a_lie(0.3, 1.0, "joint.1")], 1.0)
+    lies.add(3, [a_lie(0.0, 1.0, "joint.1")], 1.0)  # another table
+    lies.add(4, [a_lie(0.0, 1.0, "joint.1", is_hidden=False)], 1.0)
+    rows = [(known.lie.elements[0], known.lie.start, known.lie.end, known.first, known.last) for known in lies.known]
+    assert rows == [
+        ("joint.0", 0.4, 0.7, 0, 2),
+        ("joint.1", 0.1, 0.5, 0, 0),
+        ("joint.1", 0.0, 2.0, 1, 1),
+        ("joint.1", 0.3, 1.0, 2, 2),
+        ("joint.1", 0.0, 1.0, 3, 3),
+        ("joint.1", 0.0, 1.0, 4, 4),
+    ]
+    assert [lies._label(known) for known in lies.known[:2]] == ["a.csv, 0 to 2", "a.csv, 0"]
+
+
+def test_a_table_of_one_episode_is_named_without_a_number():
+    lies = _Lies(["a.csv", "b.csv"])
+    lies.add(1, [a_lie(0.0, 1.0, "joint.1")], 1.0)
+    assert lies._label(lies.known[0]) == "b.csv"
