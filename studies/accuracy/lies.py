@@ -1,14 +1,15 @@
 """Sensors that lie: how many are found, how soon, which element is hidden, and what an ordinary threshold finds.
 
-    python -m studies.accuracy.lies [--robots kxr_humanoid pr2_duster musashi_arm kuka] [--kinds swapped] [--seeds 6]
-        [--first 1000] [--healthy]
+    python -m studies.accuracy.lies [--robots kxr_humanoid pr2_duster musashi_arm kuka pam_arm car] [--kinds swapped]
+        [--seeds 6] [--first 1000] [--healthy]
 
 Each robot moves at random: the humanoid and the PR2 by the designer's forecast with the noise of their sensors, the
-muscle-driven arm in simulated physics with friction; the KUKA is a recording of a real robot, five times slower. Models
+muscle-driven arm in simulated physics with friction; the KUKA is a recording of a real robot, five times slower, and
+`pam_arm` one of a real arm with eight pneumatic muscles, at a rate that is not known and taken for 50 Hz. Models
 are trained once and kept in runs/lies. A lie begins after 20 s in an element drawn by the seed and lasts for 8 s. Its
 size is in standard errors of the healthy prediction: the error of the model's estimate of this element while it is
-hidden, on healthy motion (for the KUKA that of the watch). The other method is ridge regression of each element on all
-others, learned from the same normal samples, with the largest error of the healthy motion that is judged as the
+hidden, on healthy motion (for recorded robots that of the watch). The other method is ridge regression of each element
+on all others, learned from the same normal samples, with the largest error of the healthy motion that is judged as the
 threshold (so it raises no false alarm in it), and the largest multiple of it as the culprit.
 """
 
@@ -41,6 +42,8 @@ LATE = 2.0
 """After this time [s] a value that is wrong by more than three standard errors must not be passed on as measured."""
 ANGLES = ("joint", "motor_position", "second", "steering")
 """Signals whose names begin so wrap at a whole turn."""
+RECORDED = ("kuka", "pam_arm")
+"""The sizes of lies of these robots are in errors of the watch, because not every element has an estimate."""
 CACHE = Path("runs/lies")
 Random = np.random.Generator
 Normalised = dict[str, np.ndarray]
@@ -83,7 +86,7 @@ def body_of(name: str) -> Body:
     assert relations is not None
     columns = relations.columns[: relations.count]
     rows = {c: under(schema, c).scaler.normalise(schema.layout.join(values)) for c, values in motion.items()}
-    error = _errors(schema, rows, relations) if name == "kuka" else _estimate_errors(schema, motion, columns)
+    error = _errors(schema, rows, relations) if name in RECORDED else _estimate_errors(schema, motion, columns)
     assert schema.normal is not None
     every = schema.normal.rows.astype(float)[:, columns]
     ridge = np.zeros((len(columns) + 1, len(columns)))

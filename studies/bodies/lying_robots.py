@@ -42,6 +42,10 @@ DRIVEN, DRIVES = 1200.0, 5.0
 ARM, LIVED, JUDGED = 921, 400.0, 300.0
 """Number of the muscle-driven arm, and the lengths [s] of the motion to learn from and of that to judge."""
 
+PAM_LEARNED, PAM_JUDGED = slice(0, 400), slice(800, 1300)
+"""Episodes of the arm with pneumatic muscles, every second row of them; its rate is not known."""
+PAM_UNITS = "rad", "rad/s", "1", "1"
+
 
 def _robot(name: str) -> RobotConfig:
     return load_robot(Path("robots") / f"{name}.yaml")
@@ -99,12 +103,15 @@ def _arm(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, 
     return schema, {"": {s: v[half:] for s, v in other.items()}}
 
 
+def _data(*names: str) -> Path:
+    return Path(os.environ.get("GEMUCO_DATA", "../shared/data")).joinpath(*names)
+
+
 def _kuka(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
     """Learn the two encoders of axes 1 to 3 from trajectory A, and judge B, 4 ms steps."""
-    folder = Path(os.environ.get("GEMUCO_DATA", "../shared/data")) / "kuka_kr300"
 
     def rows(letter: str) -> Rows:
-        with np.load(folder / f"trajectory_{letter}.npz") as file:
+        with np.load(_data("kuka_kr300", f"trajectory_{letter}.npz")) as file:
             motor, second = (
                 np.radians(file[key][:, :3].astype(float)) for key in ("act_pos_mot_deg", "act_pos_se_deg")
             )
@@ -117,6 +124,19 @@ def _kuka(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema,
     return schema, {"": judged}
 
 
+def _pam(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
+    """Learn a real arm with eight pneumatic muscles from the morning, and judge a later part of the day."""
+    names = JOINTS, "joint_velocity", "muscle_pressure", "pressure_command"
+    with np.load(_data("pam_arm", "first_80_percent.npz")) as file:
+        day = {name: file[name][::2].astype(float) for name in names}
+        numbers = file["episode"][::2]
+    order = np.unique(numbers)
+    train = [{s: v[numbers == number] for s, v in day.items()} for number in order[PAM_LEARNED]]
+    masks = [names[1:], names[1:3]]
+    schema, _ = fit(train, config(seed=0), masks, x_out=(JOINTS,), units=dict(zip(names, PAM_UNITS, strict=True)))
+    return schema, {"": {s: v[np.isin(numbers, order[PAM_JUDGED])] for s, v in day.items()}}
+
+
 def _car(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
     schema, _ = fit([vehicle.drive(1, DRIVEN, DRIVES)], config(seed=0), vehicle.MASKS, units=vehicle.UNITS)
     return schema, {"": vehicle.drive(2, DRIVEN, float(RATE))}
@@ -127,6 +147,7 @@ BODIES: dict[str, Callable[..., tuple[BodySchema, Motion]]] = {
     "pr2_duster": partial(_with_tools, "pr2_duster"),
     "musashi_arm": _arm,
     "kuka": _kuka,
+    "pam_arm": _pam,
     "car": _car,
 }
 """Robot -> function of `fit`, `TrainConfig` and `learn_normal` that returns model and healthy motion by condition."""
