@@ -110,8 +110,8 @@ def running(
     tried = pace.rates_to_try(robot.rates)
     if tried[0] != robot.rates:
         console.print(
-            f"The story is played at {tried[0].hal:g} Hz: {robot.rates.hal:g} Hz would keep all {cores()} processor "
-            "cores busy."
+            f"This machine has few processor cores ({cores()}), so the story is played at {tried[0].hal:g} Hz, not at "
+            f"{robot.rates.hal:g} Hz."
         )
     for rates in tried:
         is_last = rates is tried[-1]

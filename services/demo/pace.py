@@ -22,8 +22,8 @@ MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
 tolerate a few missed cycles; a machine that is fast enough misses none."""
 HALVINGS = 2
 """The rate is halved at most this often: commands need at least a quarter of 200 Hz."""
-FEW_CORES = 2
-"""With at most this many processor cores the story begins at half the rate: at 200 Hz the muscle-driven
+FEW_CORES, CALM_RATE = 2, 100.0
+"""With at most this number of processor cores the story begins with at most this rate [Hz]: at 200 Hz the muscle-driven
 arm takes 1.7 cores, so that every stall of the machine would stop the robot."""
 
 
@@ -96,11 +96,13 @@ def _newest(client: Client) -> Status:
 
 
 def rates_to_try(rates: RatesConfig) -> list[RatesConfig]:
-    """Return the rates of the robot file, halves and quarters of them; on a machine of few cores without the first."""
+    """Return the rates of the robot file, their halves and quarters; on a machine of few cores without fast ones."""
     tried = [rates]
     for _ in range(HALVINGS):
         tried.append(halved(tried[-1]))
-    return tried[1:] if cores() <= FEW_CORES else tried
+    if cores() <= FEW_CORES:
+        return [slower for slower in tried if slower.hal <= CALM_RATE] or tried[-1:]
+    return tried
 
 
 def halved(rates: RatesConfig) -> RatesConfig:

@@ -76,6 +76,24 @@ def test_half_the_rate_is_half_of_all_that_follows_the_cycle(arm: Path) -> None:
     assert quarter.model_dump() == {"hal": 50, "estimation": 50, "anomaly": 25, "control": 50, "update": 10}
 
 
+@pytest.mark.parametrize(
+    ("cores", "rate", "tried"),
+    [
+        (2, 200, [100, 50]),
+        (2, 100, [100, 50, 25]),
+        (2, 1000, [250]),
+        (4, 1000, [1000, 500, 250]),
+        (3, 50, [50, 25, 12.5]),
+    ],
+)
+def test_few_cores_try_no_fast_rates(
+    monkeypatch: pytest.MonkeyPatch, arm: Path, cores: int, rate: float, tried: list[float]
+) -> None:
+    monkeypatch.setattr(pace, "cores", lambda: cores)
+    rates = load_robot(arm).rates.model_copy(update={"hal": rate})
+    assert [slower.hal for slower in pace.rates_to_try(rates)] == tried
+
+
 def test_the_same_robot_at_another_rate_needs_no_other_model(arm: Path) -> None:
     robot = load_robot(arm)
     rates = halved(robot.rates)
@@ -144,7 +162,7 @@ class Processes:
         (4, 100, [200, 100], ["keep 200 Hz: 100 of 800", "again at 100 Hz"]),
         (4, 50, [200, 100, 50], ["again at 100 Hz", "again at 50 Hz"]),
         (4, 10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played in spite of this"]),
-        (2, 200, [100], ["played at 100 Hz: 200 Hz would keep all 2 processor cores busy"]),
+        (2, 200, [100], ["few processor cores (2), so the story is played at 100 Hz, not at 200 Hz"]),
         (1, 50, [100, 50], ["played at 100 Hz", "again at 50 Hz"]),
         (2, 10, [100, 50], ["played at 100 Hz", "again at 50 Hz", "played in spite of this"]),
     ],
