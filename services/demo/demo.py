@@ -41,6 +41,9 @@ from services.show import progress
 
 AFTER_SIMULATOR = {"hal", "vision"}
 """These processes look for the simulator's buses when they start."""
+CONNECTS_WITHIN = 15.0
+"""If a process is not connected for this time [s], the client opens its session anew: under load zenoh now and then
+gives up one of its connections for good, as two of 60 starts of the demo showed."""
 READY_WITHIN = 180.0
 """A process must be ready within this time [s], also on a busy machine."""
 
@@ -349,11 +352,18 @@ def _is_running(client: Client, name: str) -> Callable[[], bool]:
 
     Before it has learned what is normal on this body it may suspect one for as long as the arm rests.
     """
+    opened = time.monotonic()
 
     def is_running() -> bool:
+        nonlocal opened
         status = client.status(name)
-        is_estimating = name == "model" and client.estimate() is not None
-        return status is not None and (status.state == "running" or is_estimating)
+        if status is None:
+            if time.monotonic() - opened > CONNECTS_WITHIN and name not in client.alive():
+                client.close()
+                client.__enter__()  # its readers are made anew when they are used
+                opened = time.monotonic()
+            return False
+        return status.state == "running" or (name == "model" and client.estimate() is not None)
 
     return is_running
 
