@@ -42,8 +42,8 @@ from services.show import progress
 AFTER_SIMULATOR = {"hal", "vision"}
 """These processes look for the simulator's buses when they start."""
 CONNECTS_WITHIN = 15.0
-"""If a process is not connected for this time [s], the client opens its session anew: under load zenoh now and then
-gives up one of its connections for good, as two of 60 starts of the demo showed."""
+"""If a process is not connected for this time [s], the client opens its session anew. In one of about 60 starts on a
+slow machine, perhaps in two, a connection was not made for minutes; the cause is not known."""
 READY_WITHIN = 180.0
 """A process must be ready within this time [s], also on a busy machine."""
 

@@ -41,10 +41,10 @@ DRIVEN, DRIVES = 1200.0, 5.0
 """Length [s] and rate [Hz] of the drive that a model of the car is learned from."""
 ARM, LIVED, JUDGED = 921, 400.0, 300.0
 """Number of the muscle-driven arm, and the lengths [s] of the motion to learn from and of that to judge."""
-
 PAM_LEARNED, PAM_JUDGED = slice(0, 400), slice(800, 1300)
 """Episodes of the arm with pneumatic muscles, every second row of them; its rate is not known."""
 PAM_UNITS = "rad", "rad/s", "1", "1"
+"""Units of its positions, velocities, pressures and commanded pressures, which the publishers normalised."""
 
 
 def _robot(name: str) -> RobotConfig:
@@ -125,7 +125,7 @@ def _kuka(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema,
 
 
 def _pam(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
-    """Learn a real arm with eight pneumatic muscles from the morning, and judge a later part of the day."""
+    """Learn a real arm with eight pneumatic muscles from the first episodes of a day, and judge later ones."""
     names = JOINTS, "joint_velocity", "muscle_pressure", "pressure_command"
     with np.load(_data("pam_arm", "first_80_percent.npz")) as file:
         day = {name: file[name][::2].astype(float) for name in names}
