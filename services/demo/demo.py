@@ -41,9 +41,6 @@ from services.show import progress
 
 AFTER_SIMULATOR = {"hal", "vision"}
 """These processes look for the simulator's buses when they start."""
-CONNECTS_WITHIN = 15.0
-"""If a process is not connected for this time [s], the client opens its session anew. In one of about 60 starts on a
-slow machine, perhaps in two, a connection was not made for minutes; the cause is not known."""
 READY_WITHIN = 180.0
 """A process must be ready within this time [s], also on a busy machine."""
 
@@ -333,7 +330,7 @@ def await_ready(name: str, supervisor: Supervisor, client: Client, console: Cons
     """
     with waiting(console, f"starting {name}"):
         try:
-            supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+            supervisor.wait_ready(name, lambda: _is_running(client, name), READY_WITHIN)
         except NotReady as error:
             raise NotReady(f"{error} {_seen_of(client, name)}") from None
 
@@ -347,25 +344,15 @@ def _seen_of(client: Client, name: str) -> str:
     return f"It is {connected}{estimate}; its status is {status.state}. {status.text}".rstrip()
 
 
-def _is_running(client: Client, name: str) -> Callable[[], bool]:
-    """Return a function that returns whether a process runs; a model that estimates does, even if it suspects a sensor.
+def _is_running(client: Client, name: str) -> bool:
+    """Whether a process runs; a model that estimates does, even if it suspects a sensor.
 
     Before it has learned what is normal on this body it may suspect one for as long as the arm rests.
     """
-    opened = time.monotonic()
-
-    def is_running() -> bool:
-        nonlocal opened
-        status = client.status(name)
-        if status is None:
-            if time.monotonic() - opened > CONNECTS_WITHIN and name not in client.alive():
-                client.close()
-                client.__enter__()  # its readers are made anew when they are used
-                opened = time.monotonic()
-            return False
-        return status.state == "running" or (name == "model" and client.estimate() is not None)
-
-    return is_running
+    status = client.status(name)
+    if status is None:
+        return False
+    return status.state == "running" or (name == "model" and client.estimate() is not None)
 
 
 class RemoteClient:

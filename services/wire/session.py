@@ -45,8 +45,15 @@ OPEN_WITHIN = 3.0
 """A client waits at most this long [s] for its router."""
 LEASE_MS = 900
 """A frozen or unreachable process counts as alive for this time; one that dies is noticed within milliseconds."""
-ANSWER_MS = 500
-"""A handshake that gets no answer within this time is repeated."""
+OPEN_MS, ACCEPT_MS = 2000, 3000
+"""A handshake has this time at the side that connects, and at the side that listens; then it is repeated.
+
+zenoh 1.10 keeps half of a connection if a process is stopped within its handshake until the time has passed, and the
+other half refuses every later connection of this session, for ever. Therefore the side that connects has more than
+`LEASE_MS`, after which the other side has forgotten it, and the side that listens does not give up first.
+"""
+LOCAL_OPEN_MS, LOCAL_ACCEPT_MS = 10_000, 15_000
+"""The same on this machine, where a handshake is never lost and so need not be repeated soon."""
 MAX_RECEIVED = 4 * MAX_BYTES
 """Longer messages [bytes] are dropped by zenoh; shorter ones above `MAX_BYTES` are counted as malformed."""
 CLOSE_WITHIN = 2.0
@@ -116,6 +123,8 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         },
         **common_settings(),
     }
+    if not endpoints and not files:
+        own["transport"]["unicast"] = {"open_timeout": LOCAL_OPEN_MS, "accept_timeout": LOCAL_ACCEPT_MS}
     configuration = with_role_files(own, files, endpoints)
     _check_member(configuration, robot, role)
     return configuration
@@ -139,7 +148,7 @@ def common_settings() -> dict[str, Any]:
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "transport": {
-            "unicast": {"open_timeout": ANSWER_MS, "accept_timeout": 1000},
+            "unicast": {"open_timeout": OPEN_MS, "accept_timeout": ACCEPT_MS},
             "link": {"tx": {"lease": LEASE_MS}, "rx": {"max_message_size": MAX_RECEIVED}},
             # A receiver that is descheduled for 100 ms loses queries that travel by shared memory.
             "shared_memory": {"enabled": False},
@@ -230,7 +239,7 @@ def _no_link(configuration: dict[str, Any], who: str) -> ServiceError:
         hint = "It may want a role file (`--connect ROLE.json`), as `gemuco security init` makes them."
     return NotAllowed(
         f"No zenoh session for {who}: {', '.join(listening)} refused it. {hint} "
-        f"If the router is only starting, or busy, it took longer than {ANSWER_MS / 1e3:g} s: try again."
+        f"If the router is only starting, or busy, it took longer than {OPEN_MS / 1e3:g} s: try again."
     )
 
 

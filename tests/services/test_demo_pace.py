@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -220,7 +219,7 @@ def test_a_model_that_suspects_a_sensor_of_an_unknown_body_runs(
         def estimate(self) -> object:
             return object() if estimates else None
 
-    assert demo._is_running(Publishing(), name)() == runs  # type: ignore[arg-type]
+    assert demo._is_running(Publishing(), name) == runs  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -250,34 +249,3 @@ def test_of_a_process_that_is_not_ready_the_error_says_what_arrives(
         demo.await_ready("model", supervisor, Client(), Console())  # type: ignore[arg-type]
     assert str(error.value).endswith(words)
     assert "model.log" in str(error.value)
-
-
-@pytest.mark.parametrize(("is_connected", "opened"), [(False, 2), (True, 1)])
-def test_a_client_that_zenoh_does_not_connect_opens_its_session_anew(
-    monkeypatch: pytest.MonkeyPatch, is_connected: bool, opened: int
-) -> None:
-    """Only the second session sees the process; one that is connected and silent is not helped by another."""
-
-    class Lost:
-        sessions = 1
-
-        def status(self, service: str) -> Status | None:
-            is_seen = self.sessions == 2
-            return Status(service=service, state="running") if is_seen else None
-
-        def alive(self) -> set[str]:
-            return {"simulator"} if is_connected else set()
-
-        def close(self) -> None:
-            self.sessions += 1
-
-        def __enter__(self) -> "Lost":
-            return self
-
-    clock = iter(range(0, 1000, 4))
-    monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=lambda: float(next(clock))))
-    client = Lost()
-    is_running = demo._is_running(client, "simulator")  # type: ignore[arg-type]
-    seen = [is_running() for _ in range(8)]
-    assert client.sessions == opened
-    assert seen == [False] * 4 + [opened == 2] * 4
