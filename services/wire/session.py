@@ -6,6 +6,7 @@ nothing leaves the machine unless `connect` says so. Its items are endpoints, su
 (`tcp/192.168.0.5:7447`), and role files of `gemuco security init`: zenoh configurations that are merged into ours.
 """
 
+import atexit
 import ipaddress
 import json
 import logging
@@ -45,19 +46,20 @@ OPEN_WITHIN = 3.0
 """A client waits at most this long [s] for its router."""
 LEASE_MS = 900
 """A frozen or unreachable process counts as alive for this time; one that dies is noticed within milliseconds."""
-OPEN_MS, ACCEPT_MS = 2000, 3000
+OPEN_MS, ACCEPT_MS = 2500, 2800
 """A handshake has this time at the side that connects, and at the side that listens; then it is repeated.
 
 zenoh 1.10 keeps half of a connection if a process is stopped within its handshake until the time has passed, and the
 other half refuses every later connection of this session, for ever. Therefore the side that connects has more than
-`LEASE_MS`, after which the other side has forgotten it, and the side that listens does not give up first.
+`LEASE_MS`, after which the other side has forgotten it, and the side that listens does not give up first. A session
+that closes waits for its handshakes, so neither has more than `CLOSE_WITHIN`.
 """
-LOCAL_OPEN_MS, LOCAL_ACCEPT_MS = 10_000, 15_000
-"""The same on this machine, where a handshake is never lost and so need not be repeated soon."""
 MAX_RECEIVED = 4 * MAX_BYTES
 """Longer messages [bytes] are dropped by zenoh; shorter ones above `MAX_BYTES` are counted as malformed."""
-CLOSE_WITHIN = 2.0
+CLOSE_WITHIN = 3.0
 """A program waits at most this long [s] for a session to close."""
+EXIT_WITHIN = 10.0
+"""And this long at its end."""
 
 
 def port(robot: str, service: str) -> int:
@@ -123,8 +125,6 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         },
         **common_settings(),
     }
-    if not endpoints and not files:
-        own["transport"]["unicast"] = {"open_timeout": LOCAL_OPEN_MS, "accept_timeout": LOCAL_ACCEPT_MS}
     configuration = with_role_files(own, files, endpoints)
     _check_member(configuration, robot, role)
     return configuration
@@ -244,7 +244,9 @@ def _no_link(configuration: dict[str, Any], who: str) -> ServiceError:
 
 
 def close_session(session: zenoh.Session) -> None:
-    """Close a session within `CLOSE_WITHIN`: zenoh may block for 10 s on a lossy link."""
+    """Close a session within `CLOSE_WITHIN`: zenoh may block for 10 s on a lossy link, for which only exit waits."""
     closing = threading.Thread(target=session.close, name="close session", daemon=True)
     closing.start()
     closing.join(CLOSE_WITHIN)
+    if closing.is_alive():
+        atexit.register(closing.join, EXIT_WITHIN)  # an interpreter that ends beside it aborts the process
