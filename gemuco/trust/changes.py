@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+FAINT = 2.0
+"""Below this deviation [standard deviations] the smaller of the step test's two is not computed: it is no evidence."""
 AGES = (1, 2, 3, 5, 8, 12, 20, 30)
 """A change may be this number of blocks old."""
 LONGEST = AGES[-1]
@@ -35,6 +37,10 @@ class Likeness:
         slow = np.clip((far / near) ** (1.0 / (apart - 1)), 0.3, 0.97)
         return cls(slow, np.clip(1.0 - near / slow, 0.02, 0.98))
 
+    def of_columns(self, columns: np.ndarray) -> "Likeness":
+        """Return the likeness of some columns."""
+        return Likeness(self.slow[columns], self.white[columns])
+
     @property
     def time(self) -> np.ndarray:
         """Number of blocks that are worth one independent block, shape (n,)."""
@@ -58,7 +64,7 @@ class StepTest:
     def __init__(self, likeness: Likeness) -> None:
         self._likeness = likeness
         self._steps = (np.arange(LONGEST)[None, :] >= LONGEST - np.array(AGES)[:, None]).astype(float)
-        self._weights: dict[bytes, np.ndarray] = {}
+        self._weights: dict[tuple[bytes, bytes], np.ndarray] = {}
 
     def __call__(self, z: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the largest deviation over all ages [standard deviations], and its index into `AGES`, shapes (n,).
@@ -69,26 +75,31 @@ class StepTest:
         """
         known = np.isfinite(z)
         each = np.zeros((z.shape[1], len(AGES)))
-        for pattern in np.unique(known, axis=1).T:
-            own = (known == pattern[:, None]).all(axis=0)
-            both = [
-                np.abs(np.einsum("nab,bn->na", self._weights_of(pattern, places)[own], z[:, own][pattern]))
-                for places in (np.arange(LONGEST, dtype=float), moved)
-            ]
-            each[own] = np.minimum(*both)
+        patterns = known[:, :1].T if (known == known[:, :1]).all() else np.unique(known, axis=1).T
+        for pattern in patterns:
+            own = np.flatnonzero((known == pattern[:, None]).all(axis=0))
+            each[own] = self._deviations(z, own, pattern, np.arange(LONGEST, dtype=float))
+            large = own[each[own].max(axis=1) >= FAINT]
+            each[large] = np.minimum(each[large], self._deviations(z, large, pattern, moved))
         best = each.argmax(axis=1)
         return each[np.arange(len(best)), best], best
 
-    def _weights_of(self, known: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Return the deviations by the known errors, shape (n, ages, number of known ones)."""
-        key = known.tobytes() + places.tobytes()
-        weights = self._weights.get(key)
-        if weights is None:
-            steps, precisions = self._steps[:, known], np.linalg.inv(self._likeness.covariances(places[known]))
-            scaled = np.einsum("ab,nbc->nac", steps, precisions)
+    def _deviations(self, z: np.ndarray, columns: np.ndarray, known: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Return the deviations of some columns by their known errors at these places, shape (columns, ages)."""
+        weights = self._weights_of(columns, known, places)
+        return np.abs(np.einsum("nab,bn->na", weights, z[:, columns][known]))
+
+    def _weights_of(self, columns: np.ndarray, known: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Return the weights of the known errors in the deviations of some columns, shape (columns, ages, known)."""
+        size, key = len(self._likeness.slow), (known.tobytes(), places.tobytes())
+        weights = self._weights.setdefault(key, np.full((size, len(AGES), int(known.sum())), np.nan))
+        fresh = columns[np.isnan(weights[columns]).all(axis=(1, 2))]
+        if len(fresh):
+            steps, likeness = self._steps[:, known], self._likeness.of_columns(fresh)
+            scaled = np.einsum("ab,nbc->nac", steps, np.linalg.inv(likeness.covariances(places[known])))
             information = np.einsum("nac,ac->na", scaled, steps)
-            weights = self._weights[key] = scaled / np.sqrt(np.maximum(information, 1e-12))[..., None]
-        return weights
+            weights[fresh] = scaled / np.sqrt(np.maximum(information, 1e-12))[..., None]
+        return weights[columns]
 
 
 class LastingTest:

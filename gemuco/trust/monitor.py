@@ -39,9 +39,9 @@ STRANGE = 1.8
 """If the errors without a cause are usually this multiple of those that were learned, no sensor is hidden."""
 LAPSES = 10
 """A suspicion ends if nothing speaks for it in this number of blocks."""
-DOUBTFUL, PLAIN = 0.4, 1.5
+DOUBTFUL, PLAIN, AMONG = 0.4, 1.5, 0.5
 """From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
-second multiple of an alarm."""
+second multiple of an alarm. One of them has at least the third share of the largest evidence."""
 UNEXPLAINED, ONCE_MORE = 3, 100
 """If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
@@ -304,8 +304,9 @@ class TrustMonitor:
 
     def _hides_others(self, ratio: np.ndarray, hidden: Hidden) -> bool:
         """Whether one of the columns with the most evidence hides another one that is wrong too."""
-        without, order = self._without(hidden), np.argsort(-ratio)[:SEARCHED]
-        alone = (float(without(frozenset({int(column)})).ratio.max()) for column in order if ratio[column] > 0.0)
+        without, least = self._without(hidden), AMONG * float(ratio.max())
+        order = [int(column) for column in np.argsort(-ratio)[:SEARCHED] if ratio[column] >= least]
+        alone = (float(without(frozenset({column})).ratio.max()) for column in order)
         return any(highest >= PLAIN for highest in alone)
 
     def _limit_at_once(self, new: Case) -> None:

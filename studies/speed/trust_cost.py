@@ -1,6 +1,6 @@
 """Cost of the test for lies: its share of a core, by body and by what happens.
 
-    python -m studies.speed.trust_cost [--robots kxr_humanoid pr2_duster musashi_arm kuka]
+    python -m studies.speed.trust_cost [--robots kxr_humanoid pr2_duster musashi_arm kuka pam_arm]
 
 Bodies and motion are those of `studies.accuracy.lies`; a service judges ten blocks per second. `lie`: an element is
 wrong by five of its standard deviations. `wrong body`: every sensor of one signal reads 5 % too much, on a body that is
