@@ -23,6 +23,9 @@ PERSON_SESSIONS = 32
 EMERGENCY_PORT = 1
 FIRST_PERSON_PORT = 2
 """The port for emergency stops, and that of the first person, counted from the router's port."""
+PERSON_OPENS_MS = 2000
+"""A person's session has this time [ms] to open, because certificates and passwords need several round trips."""
+ROUTER_ACCEPTS_MS = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +100,7 @@ def _router(plan: InstallationPlan, known: Mapping[str, Secrets]) -> dict[str, A
         "metadata": {"gemuco": {DOORS: _doors(plan, known)}},
         "listen": {"endpoints": [_door_endpoint(plan, 0)]},
         "transport": {
-            "unicast": {"max_sessions": ROUTER_SESSIONS},
+            "unicast": {"max_sessions": ROUTER_SESSIONS, "accept_timeout": ROUTER_ACCEPTS_MS},
             "auth": {"usrpwd": {"dictionary": _dictionary(members, known)}},
         },
         "access_control": access.access_control(
@@ -189,6 +192,7 @@ def _person(plan: InstallationPlan, name: str) -> dict[str, Any]:
     own: dict[str, Any] = {
         "mode": "client",
         "connect": {"endpoints": _dialled(plan, person_ports(plan)[name])},
+        "transport": {"unicast": {"open_timeout": PERSON_OPENS_MS}},
         "access_control": access.access_control({ROUTER: (access.identity_of(ROUTER, dials=False), rules)}),
     }
     if member.may_ask(member.robots[0], *ESTOP):

@@ -46,14 +46,16 @@ OPEN_WITHIN = 3.0
 """A client waits at most this long [s] for its router."""
 LEASE_MS = 900
 """A frozen or unreachable process counts as alive for this time; one that dies is noticed within milliseconds."""
-OPEN_MS, ACCEPT_MS = 2500, 2800
-"""A handshake has this time at the side that connects, and at the side that listens; then it is repeated.
+OPEN_MS, ACCEPT_MS = 500, 1000
+"""A handshake has this time at the side that connects, and at the side that listens, which is not the first to give up;
+then it is repeated, because its packets may be lost.
 
 zenoh 1.10 keeps half of a connection if a process is stopped within its handshake until the time has passed, and the
-other half refuses every later connection of this session, for ever. Therefore the side that connects has more than
-`LEASE_MS`, after which the other side has forgotten it, and the side that listens does not give up first. A session
-that closes waits for its handshakes, so neither has more than `CLOSE_WITHIN`.
+other half refuses every later connection of this session, for ever, unless `LEASE_MS` has passed for it too.
 """
+LOCAL_OPEN_MS, LOCAL_ACCEPT_MS = 2500, 2800
+"""The same between processes of one machine, where no packet is lost but stops are usual: more than `LEASE_MS`. A
+session that closes waits for its handshakes, so it is less than `CLOSE_WITHIN`."""
 MAX_RECEIVED = 4 * MAX_BYTES
 """Longer messages [bytes] are dropped by zenoh; shorter ones above `MAX_BYTES` are counted as malformed."""
 CLOSE_WITHIN = 3.0
@@ -125,6 +127,8 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         },
         **common_settings(),
     }
+    if not endpoints and not files:
+        own["transport"]["unicast"] = {"open_timeout": LOCAL_OPEN_MS, "accept_timeout": LOCAL_ACCEPT_MS}
     configuration = with_role_files(own, files, endpoints)
     _check_member(configuration, robot, role)
     return configuration
