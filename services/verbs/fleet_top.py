@@ -90,7 +90,7 @@ def table(robots: Sequence[tuple[RobotSnapshot, Trouble]], width: int = WIDE) ->
     """Return one row per robot, in the order given, for a terminal of this width."""
     counts = {level: sum(worst.level == level for _, worst in robots) for level in reversed(Level)}
     summary = ", ".join(f"{count} {level.name.lower()}" for level, count in counts.items() if count)
-    title = f"{len(robots)} robots: {summary}"
+    title = f"{len(robots)} robot{'' if len(robots) == 1 else 's'}: {summary}"
     if width < WIDE:
         return _narrow(robots, title)
     table = Table(title=title, title_justify="left", expand=True)
