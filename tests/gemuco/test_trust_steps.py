@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gemuco.trust.changes import AGES, LONGEST, Likeness, StepTest
+from gemuco.trust.changes import AGES, FAINT, LONGEST, Likeness, StepTest
 from gemuco.trust.evidence import Judge, burst
 from gemuco.trust.healthy import NOISE_KNOWN, Healthy
 from gemuco.trust.recent import NOISY, View, _noise
@@ -52,6 +52,24 @@ def test_errors_at_one_posture_say_the_same_again_and_again():
     jump = resting.copy()
     jump[-5:] += 12.0
     assert np.median(test(jump, arrived)[0]) == pytest.approx(np.median(test(jump, MOVING)[0]), rel=0.15)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_a_column_is_judged_alone_as_among_others_that_are_quiet(gaps):
+    """The smaller of two deviations is computed for large ones only, and never for the wrong column."""
+    random, arrived = np.random.default_rng(3), np.minimum(MOVING, 12.0)
+    likeness = Likeness(random.uniform(0.5, 0.95, 12), random.uniform(0.1, 0.9, 12))
+    z = random.normal(size=(LONGEST, 12))
+    z[-6:, 4:] += random.normal(size=8) * 6.0
+    if gaps:
+        z[3:9, 2:6] = z[20:22, 5:8] = np.nan
+    together, ages = StepTest(likeness)(z, arrived)
+    for column in range(12):
+        own = Likeness(likeness.slow[[column]], likeness.white[[column]])
+        both = [StepTest(own)(z[:, [column]], moved) for moved in (MOVING, arrived)]
+        alone, age = StepTest(own)(z[:, [column]], arrived)
+        assert together[column] == pytest.approx(alone[0]) and ages[column] == age[0]
+        assert together[column] <= min(each[0][0] for each in both) + 1e-9 or together[column] < FAINT
 
 
 def test_the_age_of_a_step_is_found_across_a_gap():
