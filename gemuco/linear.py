@@ -20,6 +20,13 @@ CACHED = 256
 """At most this many regressions are cached."""
 STILL = 1e-8
 """Nothing is predicted from an element whose variance is below this [standard deviations squared]."""
+SHRINKS, TURNS = 10.0 ** np.arange(-10.0, 0.0), 12
+"""Candidate strengths of a penalty that leaves few inputs, and the number of regressions in which it does so."""
+UNUSED = 1e-3
+"""An input is left out if its weight is below this share of the largest one [standard deviations]."""
+WORSE, MORE = 3.0, 0.02
+"""Fewer inputs are used unless held-out parts show larger errors: by more than the first number of standard errors of
+the mean over the parts, or by more than the second share of the standard deviation, as all parts together must not."""
 ROBUST = 3.0
 """The weight of a row falls when its error is above this many robust standard deviations."""
 PASSES = 3
@@ -108,21 +115,108 @@ class LinearPath:
         line[-1] += self.outputs[-1]
         return np.concatenate([line * (1.0 - share), share[None]]).astype(np.float32)
 
+    def by_few(self, gate: np.ndarray, element: int) -> np.ndarray:
+        """Return the regression of an element of x_out on as few inputs as do no harm, shape (in_size + 1,).
+
+        Inputs that go together in the training data need not do so beyond it. Weights are shrunk the more, the smaller
+        they are, and the fewest inputs are kept whose errors on held-out parts of the data are not clearly larger
+        than those of all inputs.
+
+        Args:
+            gate: See `map`.
+            element: Index of the element in x_out.
+        """
+        key = np.asarray(gate > 0).tobytes() + element.to_bytes(4)
+        if key not in self._maps:
+            cross = self.cross @ self.outputs[:-1, [element]] + self.moments[:, :, -1:] * self.outputs[-1, element]
+            alone = LinearPath(self.moments, cross, np.array([[1.0], [0.0]]))
+            lines = np.stack([alone.map(kept).astype(float) for kept in (_useful(self.moments, cross, gate), gate)])
+            few, every = _losses(self.moments, cross, np.stack([lines] * len(cross))).sum(axis=(0, 2))
+            is_harmful = few - every > MORE**2 * self.moments[:, -1, -1].sum()
+            self._maps[key] = lines[int(is_harmful), :, 0]
+        return self._maps[key]
+
     def _map(self, known: np.ndarray) -> np.ndarray:
         result = np.zeros(self.cross.shape[1:], np.float32)
         if not self.width:
             return result
         moments, cross = self.moments[:, known[:, None], known], self.cross[:, known]
-        whole, total = moments.sum(axis=0), cross.sum(axis=0)
-        # one regression without each part, and one of all parts
-        lines = _regressions(
-            np.concatenate([whole - moments, whole[None]]), np.concatenate([total - cross, total[None]])
-        )
-        without = lines[:-1]
-        losses = ((moments[:, None] @ without - 2.0 * cross[:, None]) * without).sum(axis=(0, 2))
-        best = losses.argmin(axis=0)
+        lines = _regressions(*_left_out(moments, cross))
+        best = _losses(moments, cross, lines[:-1]).sum(axis=0).argmin(axis=0)
         result[known] = lines[-1][best, :, np.arange(self.width)].T
         return result
+
+
+def _left_out(moments: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums over all parts but each, and over all parts, shapes (parts + 1, ...)."""
+    whole, total = moments.sum(axis=0), cross.sum(axis=0)
+    return np.concatenate([whole - moments, whole[None]]), np.concatenate([total - cross, total[None]])
+
+
+def _losses(moments: np.ndarray, cross: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Return the squared errors in each part of lines that were learned without it, less the same for all lines.
+
+    Args:
+        moments: Sums of the products of the elements and 1 over each part, shape (parts, n + 1, n + 1).
+        cross: Sums of their products with the code, shape (parts, n + 1, width).
+        lines: Lines that were learned without each part, shape (parts, strengths, n + 1, width).
+
+    Returns:
+        Shape (parts, strengths, width).
+    """
+    return np.asarray(((moments[:, None] @ lines - 2.0 * cross[:, None]) * lines).sum(axis=2))
+
+
+def _useful(moments: np.ndarray, cross: np.ndarray, gate: np.ndarray) -> np.ndarray:
+    """Return which of the inputs of a mask are kept; see `LinearPath.by_few`.
+
+    Args:
+        moments: As in `LinearPath`.
+        cross: Sums of the products of x_in and 1 with the element, shape (parts, in_size + 1, 1).
+        gate: See `LinearPath.map`.
+
+    Returns:
+        1 for the inputs that are kept, else 0, shape (in_size,).
+    """
+    known = np.append(np.flatnonzero(gate), len(gate))
+    moments, cross = moments[:, known[:, None], known], cross[:, known]
+    sets = _left_out(moments, cross)
+    weights, lines = _shrunk(*sets)
+    counts = moments[:, -1, -1][:, None]
+    losses = _losses(moments, cross, lines[:-1])[:, :, 0] / counts
+    usual = _losses(moments, cross, _regressions(*sets)[:-1])[:, :, 0] / counts
+    both = np.concatenate([usual, losses], axis=1)
+    more = losses - both[:, [both.mean(axis=0).argmin()]]
+    limit = np.minimum(WORSE * more.std(axis=0, ddof=1) / np.sqrt(len(more)), MORE**2)
+    is_as_good = more.mean(axis=0) <= limit
+    result = np.asarray(gate > 0, float)
+    if is_as_good.any():
+        size = np.abs(weights[-1, np.flatnonzero(is_as_good)[-1]])
+        result[known[:-1]] = size > UNUSED * size.max(initial=0.0)
+    return result
+
+
+def _shrunk(moments: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return regressions whose small weights vanish, by a ridge penalty of each weight that it sets itself.
+
+    Args:
+        moments: Sums of the products of the elements and 1, shape (sets, n + 1, n + 1).
+        cross: Sums of their products with one element, shape (sets, n + 1, 1).
+
+    Returns:
+        Their weights [standard deviations], shape (sets, strengths, n), and the lines, shape (sets, strengths, n + 1,
+        1).
+    """
+    covariance, along, weight, mean, center = _standardised(moments, cross)
+    unit = np.eye(covariance.shape[-1])
+    size = np.linalg.solve(covariance + SHRINKS[0] * unit, along)[:, None].repeat(len(SHRINKS), axis=1)
+    for _ in range(TURNS):
+        scale = np.abs(size)
+        scaled = covariance[:, None] * scale * scale.swapaxes(2, 3) + SHRINKS[:, None, None] * unit
+        size = scale * np.linalg.solve(scaled, scale * along[:, None])
+    lines = size * weight[:, None]
+    whole = np.concatenate([lines, center[:, None] - mean.swapaxes(1, 2)[:, None] @ lines], axis=2)
+    return size[..., 0], whole
 
 
 def _regressions(moments: np.ndarray, cross: np.ndarray) -> np.ndarray:
@@ -135,17 +229,33 @@ def _regressions(moments: np.ndarray, cross: np.ndarray) -> np.ndarray:
     Returns:
         Shape (sets, strengths, n + 1, width).
     """
+    covariance, along, weight, mean, center = _standardised(moments, cross)
+    values, turns = np.linalg.eigh(covariance)
+    turned = turns.transpose(0, 2, 1) @ along
+    shrunk = turned[:, None] / (np.maximum(values, 0.0)[:, None] + RIDGES[:, None])[..., None]
+    lines = (turns[:, None] @ shrunk) * weight[:, None]
+    return np.concatenate([lines, center[:, None] - mean.transpose(0, 2, 1)[:, None] @ lines], axis=2)
+
+
+def _standardised(moments: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return correlations, covariances with the code, inverse standard deviations, and both means, of each set.
+
+    Args:
+        moments: See `_regressions`.
+        cross: See `_regressions`.
+
+    Returns:
+        Shapes (sets, n, n), (sets, n, width), (sets, n, 1), (sets, n, 1) and (sets, 1, width). Elements that do not
+        vary have no correlation, and an inverse standard deviation of 0.
+    """
     count = moments[:, -1:, -1:]
-    mean, center = moments[:, :-1, -1:] / count, cross[:, -1:] / count  # (sets, n, 1), (sets, 1, width)
+    mean, center = moments[:, :-1, -1:] / count, cross[:, -1:] / count
     covariance = moments[:, :-1, :-1] / count - mean * mean.transpose(0, 2, 1)
     variance = np.einsum("...ii->...i", covariance)
     is_alive = variance > STILL
     weight = np.where(is_alive, 1.0 / np.sqrt(np.where(is_alive, variance, 1.0)), 0.0)[..., None]
-    values, turns = np.linalg.eigh(covariance * weight * weight.transpose(0, 2, 1))
-    along = turns.transpose(0, 2, 1) @ ((cross[:, :-1] / count - mean * center) * weight)
-    shrunk = along[:, None] / (np.maximum(values, 0.0)[:, None] + RIDGES[:, None])[..., None]
-    lines = (turns[:, None] @ shrunk) * weight[:, None]
-    return np.concatenate([lines, center[:, None] - mean.transpose(0, 2, 1)[:, None] @ lines], axis=2)
+    correlation = covariance * weight * weight.transpose(0, 2, 1)
+    return correlation, (cross[:, :-1] / count - mean * center) * weight, weight, mean, center
 
 
 def basis(x_out: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

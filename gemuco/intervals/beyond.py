@@ -1,7 +1,8 @@
 """Estimates beyond what was learned: an output that is linear within it follows the linear path alone.
 
-The network's correction of such an output is a detail of the learned samples. Beyond them it is arbitrary. Where the
-body is not linear the network is better there too.
+The network's correction of such an output is a detail of the learned samples. Beyond them it is arbitrary. So are the
+weights of inputs that only went together in these samples, and the path is that of as few inputs as do no harm. Where
+the body is not linear the network is better there too.
 """
 
 from typing import NamedTuple
@@ -66,11 +67,12 @@ def _line(schema: BodySchema, mask: Mask) -> Line | None:
     whole = schema.infer(anchors, mask, own_bias(schema, len(anchors)) if len(schema.bias) else None)
     correction = np.sqrt(np.mean((anchors[:, inputs] @ matrix[:-1] + matrix[-1] - whole) ** 2, axis=0))
     mean, std = schema.scaler.mean, schema.scaler.std
-    follows = correction < LINEAR
-    if not follows.any():
+    follows = np.flatnonzero(correction < LINEAR)
+    if not len(follows):
         return None
+    few = np.stack([schema.path.by_few(through, int(output)) for output in follows], axis=1)
     outputs = schema.out_index[follows]
-    matrix = matrix[:, follows] * std[outputs]
+    matrix = few[np.append(through, True)] * std[outputs]
     matrix[:-1] /= std[inputs][:, None]
     matrix[-1] += mean[outputs] - mean[inputs] @ matrix[:-1]
     return Line(inputs, outputs, matrix)

@@ -102,3 +102,44 @@ def test_soap_crosses_a_narrow_valley(schema):
     assert np.abs(numbers - goal).mean() < 0.1 * np.abs(goal).mean()
     assert optimiser.time == 300
     assert all(np.isfinite(array).all() for array in optimiser.state().values())
+
+
+def _followers(random: np.random.Generator, rows: int) -> np.ndarray:
+    """Return inputs of which the second and the third follow the first with little play, as in one recorded motion."""
+    first = np.cumsum(random.normal(size=rows)) / 20.0
+    return np.stack([first, first + 0.02 * random.normal(size=rows), -first + 0.02 * random.normal(size=rows)], axis=1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_inputs_that_only_go_together_in_the_data_are_left_out_beyond_it(seed):
+    random = np.random.default_rng(seed)
+    x = _followers(random, 2000)
+    y = 0.7 * x[:, :1] + 0.2 + 0.003 * np.sin(9.0 * x[:, 1:2] + np.arange(2000)[:, None] / 300.0)
+    path = LinearPath.fit(x, y, 1)
+    few = path.by_few(np.ones(3), 0)
+    assert few[0] == pytest.approx(0.7, abs=0.01) and few[-1] == pytest.approx(0.2, abs=0.01)
+    assert np.array_equal(few[1:3], [0.0, 0.0])
+    assert np.all(path.map(np.ones(3))[1:3] != 0.0)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_an_input_that_is_needed_is_kept_also_if_it_moves_in_one_part_of_the_data_only(late):
+    random, rows = np.random.default_rng(4), 2000
+    x = random.normal(size=(rows, 4))
+    if late:
+        x[: rows * 4 // 5, 3] = 0.0
+    weights = np.array([0.8, -0.5, 0.3, 0.25])
+    path = LinearPath.fit(x, x @ weights[:, None] + 0.01 * random.normal(size=(rows, 1)), 1)
+    assert path.by_few(np.ones(4), 0)[:-1] == pytest.approx(weights, abs=0.01)
+    assert path.by_few(np.array([1.0, 1.0, 0.0, 1.0]), 0)[2] == 0.0
+
+
+def test_an_element_is_the_same_by_few_inputs_whatever_the_code():
+    """Elements of x_out are mixtures of the code, which may be shorter."""
+    random = np.random.default_rng(5)
+    x = random.normal(size=(1000, 3))
+    y = np.stack([x[:, 0], x[:, 0] * 2.0, x[:, 1] - 0.5], axis=1)
+    for width in (2, 3):
+        path = LinearPath.fit(x, y, width)
+        lines = np.stack([path.by_few(np.ones(3), element) for element in range(3)], axis=1)
+        assert lines == pytest.approx(np.array([[1, 2, 0], [0, 0, 1], [0, 0, 0], [0, 0, -0.5]], float), abs=1e-3)
