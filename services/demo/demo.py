@@ -78,7 +78,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
     report.show(ending, out, console)
     report.write(ending, path, seed, picture)
     if ending.rate != ending.wanted:
-        console.print(f"Played at {ending.rate:g} Hz, because this machine is too slow for {ending.wanted:g} Hz.")
+        console.print(f"Played at {ending.rate:g} Hz, because {ending.wanted:g} Hz are too much for this machine.")
     console.print(f"{time.monotonic() - started:.0f} s in all.")
     return 0 if ending.is_observed else 1
 

@@ -151,7 +151,7 @@ def _image(picture: Path, ending: Ending) -> str:
 
 
 def _facts(ending: Ending, path: Path) -> str:
-    kept = "" if ending.rate == ending.wanted else f", because this machine is too slow for {ending.wanted:g} Hz"
+    kept = "" if ending.rate == ending.wanted else f", because {ending.wanted:g} Hz are too much for this machine"
     rows = {
         "robot file": path.name,
         "rate": f"{ending.rate:g} Hz{kept}",

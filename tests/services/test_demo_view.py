@@ -146,7 +146,7 @@ def test_the_report_is_one_file_that_needs_no_other(tmp_path: Path) -> None:
     html = (tmp_path / "report.html").read_text()
     assert "Not every expected event was observed." in html
     assert "loses &lt;an&gt; encoder" in html
-    assert "because this machine is too slow for 200 Hz" in html
+    assert "because 200 Hz are too much for this machine" in html
     assert "gemuco demo arm.yaml --seed 7" in html
     assert 'src="data:image/png;base64,' in html
     assert "http" not in html  # nothing is loaded from elsewhere
