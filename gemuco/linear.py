@@ -131,7 +131,7 @@ class LinearPath:
             cross = self.cross @ self.outputs[:-1, [element]] + self.moments[:, :, -1:] * self.outputs[-1, element]
             alone = LinearPath(self.moments, cross, np.array([[1.0], [0.0]]))
             lines = np.stack([alone.map(kept).astype(float) for kept in (_useful(self.moments, cross, gate), gate)])
-            few, every = _losses(self.moments, cross, np.stack([lines] * len(cross))).sum(axis=(0, 2))
+            few, every = _losses(self.moments, cross, np.stack([lines] * len(cross))).sum(axis=(0, 2, 3))
             is_harmful = few - every > MORE**2 * self.moments[:, -1, -1].sum()
             self._maps[key] = lines[int(is_harmful), :, 0]
         return self._maps[key]
@@ -142,7 +142,7 @@ class LinearPath:
             return result
         moments, cross = self.moments[:, known[:, None], known], self.cross[:, known]
         lines = _regressions(*_left_out(moments, cross))
-        best = _losses(moments, cross, lines[:-1]).sum(axis=0).argmin(axis=0)
+        best = _losses(moments, cross, lines[:-1]).sum(axis=(0, 2)).argmin(axis=0)
         result[known] = lines[-1][best, :, np.arange(self.width)].T
         return result
 
@@ -154,7 +154,7 @@ def _left_out(moments: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _losses(moments: np.ndarray, cross: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Return the squared errors in each part of lines that were learned without it, less the same for all lines.
+    """Return the terms whose sum is the squared error of lines in each part, less what is the same for all lines.
 
     Args:
         moments: Sums of the products of the elements and 1 over each part, shape (parts, n + 1, n + 1).
@@ -162,9 +162,9 @@ def _losses(moments: np.ndarray, cross: np.ndarray, lines: np.ndarray) -> np.nda
         lines: Lines that were learned without each part, shape (parts, strengths, n + 1, width).
 
     Returns:
-        Shape (parts, strengths, width).
+        Shape (parts, strengths, n + 1, width).
     """
-    return np.asarray(((moments[:, None] @ lines - 2.0 * cross[:, None]) * lines).sum(axis=2))
+    return np.asarray((moments[:, None] @ lines - 2.0 * cross[:, None]) * lines)
 
 
 def _useful(moments: np.ndarray, cross: np.ndarray, gate: np.ndarray) -> np.ndarray:
@@ -183,8 +183,8 @@ def _useful(moments: np.ndarray, cross: np.ndarray, gate: np.ndarray) -> np.ndar
     sets = _left_out(moments, cross)
     weights, lines = _shrunk(*sets)
     counts = moments[:, -1, -1][:, None]
-    losses = _losses(moments, cross, lines[:-1])[:, :, 0] / counts
-    usual = _losses(moments, cross, _regressions(*sets)[:-1])[:, :, 0] / counts
+    losses = _losses(moments, cross, lines[:-1]).sum(axis=(2, 3)) / counts
+    usual = _losses(moments, cross, _regressions(*sets)[:-1]).sum(axis=(2, 3)) / counts
     both = np.concatenate([usual, losses], axis=1)
     more = losses - both[:, [both.mean(axis=0).argmin()]]
     limit = np.minimum(WORSE * more.std(axis=0, ddof=1) / np.sqrt(len(more)), MORE**2)
