@@ -94,12 +94,9 @@ class LinearPath:
             gate: 1 for the elements of x_in that the mask contains, else 0, shape (in_size,).
         """
         key = np.asarray(gate > 0).tobytes()
-        result = self._maps.get(key)
-        if result is None:
-            if len(self._maps) >= CACHED:
-                self._maps.clear()
-            result = self._maps[key] = self._map(np.append(np.flatnonzero(gate), len(gate)))
-        return result
+        if key not in self._maps:
+            self._keep(key, self._map(np.append(np.flatnonzero(gate), len(gate))))
+        return self._maps[key]
 
     def direct(self, gate: np.ndarray, share: np.ndarray) -> np.ndarray:
         """Return the part of the linear path in x_out: its regression times 1 - share, then the share of the network.
@@ -133,8 +130,13 @@ class LinearPath:
             lines = np.stack([alone.map(kept).astype(float) for kept in (_useful(self.moments, cross, gate), gate)])
             few, every = _losses(self.moments, cross, np.stack([lines] * len(cross))).sum(axis=(0, 2, 3))
             is_harmful = few - every > MORE**2 * self.moments[:, -1, -1].sum()
-            self._maps[key] = lines[int(is_harmful), :, 0]
+            self._keep(key, lines[int(is_harmful), :, 0])
         return self._maps[key]
+
+    def _keep(self, key: bytes, line: np.ndarray) -> None:
+        if len(self._maps) >= CACHED:
+            self._maps.clear()
+        self._maps[key] = line
 
     def _map(self, known: np.ndarray) -> np.ndarray:
         result = np.zeros(self.cross.shape[1:], np.float32)
@@ -182,7 +184,7 @@ def _useful(moments: np.ndarray, cross: np.ndarray, gate: np.ndarray) -> np.ndar
     moments, cross = moments[:, known[:, None], known], cross[:, known]
     sets = _left_out(moments, cross)
     weights, lines = _shrunk(*sets)
-    counts = moments[:, -1, -1][:, None]
+    counts = np.maximum(moments[:, -1, -1], 1.0)[:, None]  # a part may be empty
     losses = _losses(moments, cross, lines[:-1]).sum(axis=(2, 3)) / counts
     usual = _losses(moments, cross, _regressions(*sets)[:-1]).sum(axis=(2, 3)) / counts
     both = np.concatenate([usual, losses], axis=1)

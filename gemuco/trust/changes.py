@@ -92,7 +92,9 @@ class StepTest:
     def _weights_of(self, columns: np.ndarray, known: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Return the weights of the known errors in the deviations of some columns, shape (columns, ages, known)."""
         size, key = len(self._likeness.slow), (known.tobytes(), places.tobytes())
-        weights = self._weights.setdefault(key, np.full((size, len(AGES), int(known.sum())), np.nan))
+        if key not in self._weights:
+            self._weights[key] = np.full((size, len(AGES), int(known.sum())), np.nan)
+        weights = self._weights[key]
         fresh = columns[np.isnan(weights[columns]).all(axis=(1, 2))]
         if len(fresh):
             steps, likeness = self._steps[:, known], self._likeness.of_columns(fresh)

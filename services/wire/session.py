@@ -46,16 +46,13 @@ OPEN_WITHIN = 3.0
 """A client waits at most this long [s] for its router."""
 LEASE_MS = 900
 """A frozen or unreachable process counts as alive for this time; one that dies is noticed within milliseconds."""
-OPEN_MS, ACCEPT_MS = 500, 1000
-"""A handshake has this time at the side that connects, and at the side that listens, which is not the first to give up;
-then it is repeated, because its packets may be lost.
+OPEN_MS, LOCAL_OPEN_MS = 500, 2500
+"""A handshake that gets no answer is repeated after this time: soon if packets may be lost, and late between processes
+of one machine, where none is lost but stops are usual. A session that closes waits for its handshakes.
 
-zenoh 1.10 keeps half of a connection if a process is stopped within its handshake until the time has passed, and the
-other half refuses every later connection of this session, for ever, unless `LEASE_MS` has passed for it too.
+zenoh 1.10 keeps half of a connection if the process that connects is stopped within its handshake until the time has
+passed. The other half refuses every later connection of this session, for ever, unless `LEASE_MS` has passed for it.
 """
-LOCAL_OPEN_MS, LOCAL_ACCEPT_MS = 2500, 2800
-"""The same between processes of one machine, where no packet is lost but stops are usual: more than `LEASE_MS`. A
-session that closes waits for its handshakes, so it is less than `CLOSE_WITHIN`."""
 MAX_RECEIVED = 4 * MAX_BYTES
 """Longer messages [bytes] are dropped by zenoh; shorter ones above `MAX_BYTES` are counted as malformed."""
 CLOSE_WITHIN = 3.0
@@ -128,7 +125,7 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         **common_settings(),
     }
     if not endpoints and not files:
-        own["transport"]["unicast"] = {"open_timeout": LOCAL_OPEN_MS, "accept_timeout": LOCAL_ACCEPT_MS}
+        own["transport"]["unicast"]["open_timeout"] = LOCAL_OPEN_MS
     configuration = with_role_files(own, files, endpoints)
     _check_member(configuration, robot, role)
     return configuration
@@ -152,7 +149,7 @@ def common_settings() -> dict[str, Any]:
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "transport": {
-            "unicast": {"open_timeout": OPEN_MS, "accept_timeout": ACCEPT_MS},
+            "unicast": {"open_timeout": OPEN_MS, "accept_timeout": 1000},
             "link": {"tx": {"lease": LEASE_MS}, "rx": {"max_message_size": MAX_RECEIVED}},
             # A receiver that is descheduled for 100 ms loses queries that travel by shared memory.
             "shared_memory": {"enabled": False},

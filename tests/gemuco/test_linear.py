@@ -143,3 +143,14 @@ def test_an_element_is_the_same_by_few_inputs_whatever_the_code():
         path = LinearPath.fit(x, y, width)
         lines = np.stack([path.by_few(np.ones(3), element) for element in range(3)], axis=1)
         assert lines == pytest.approx(np.array([[1, 2, 0], [0, 0, 1], [0, 0, 0], [0, 0, -0.5]], float), abs=1e-3)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rows", [2, 4, 5, 30])
+def test_few_samples_and_an_input_that_rests_give_a_line(rows):
+    x = np.random.default_rng(6).normal(size=(rows, 3))
+    x[:, 1] = 0.5
+    line = LinearPath.fit(x, 2.0 * x[:, :1], 1).by_few(np.ones(3), 0)
+    assert np.isfinite(line).all() and line[1] == 0.0
+    if rows >= 5:
+        assert line == pytest.approx([2.0, 0.0, 0.0, 0.0], abs=1e-3)
