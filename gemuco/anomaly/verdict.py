@@ -8,10 +8,13 @@ import numpy as np
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
+from gemuco.anomaly.outside import outside
 from gemuco.anomaly.window import window_score
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
+HARMLESS = ("normal", "environment", "unknown", "outside")
+"""With these verdicts nothing is wrong with the body, as far as is known."""
 PLAUSIBLE = 3.0
 """A p of an environment is at most this far from the mean of the trained ones [their standard deviations]."""
 
@@ -22,13 +25,15 @@ class Verdict:
 
     Attributes:
         kind: `normal`; `environment` if another p explains the samples; `unknown` if this p, or the one in use, is
-            beyond the trained ones, so that it explains these samples and says little of others; `anomaly` if no p
-            does. Without parametric bias every change is an anomaly. Empty if no error can be judged.
+            beyond the trained ones, so that it explains these samples and says little of others; `outside` if the
+            samples are outside of what was learned, and their errors as large as is to be expected there; `anomaly` if
+            nothing explains them. Empty if no error can be judged.
         score: How far the samples are from normal under the p in use, as a share of what as many consecutive samples of
             a healthy body reach with the probability of a false alarm.
         explained: The same under the p that explains the samples best; equal to `score` if none was searched.
         bias: That p, shape (bias_size,); the one in use if none was searched.
-        blamed: `signal.element` that is most likely wrong; empty unless the kind is an anomaly.
+        blamed: `signal.element` that is most likely wrong, or, if the kind is `outside`, furthest outside of its
+            learned range; empty for other kinds.
     """
 
     kind: str
@@ -43,7 +48,8 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
 
     If the samples are unlikely under the p in use, p is recognised anew from all of them. If they are normal under the
     result and it is like the trained ones, the environment has changed (a tool, a load, a grip) and an update of p is
-    enough. Samples that no p explains are an anomaly.
+    enough. Samples that no p explains are an anomaly, unless they are outside of what was learned and every element
+    fits the others as well as can be expected there.
 
     Args:
         schema: A schema with statistics of prediction errors.
@@ -70,4 +76,7 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
         explained = window_score(schema.with_bias(bias), rows)
         if explained <= 1.0 and prior.between(bias, prior.mean) <= PLAUSIBLE:
             return Verdict("unknown" if prior.is_beyond(bias) else "environment", score, explained, bias, "")
+    furthest = outside(schema, rows)
+    if furthest:
+        return Verdict("outside", score, explained, bias, furthest)
     return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)

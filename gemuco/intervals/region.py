@@ -59,3 +59,20 @@ def _limit(anchors: np.ndarray) -> float:
     rank = min(RANK, len(anchors) - 1)  # each is nearest to itself
     near = np.partition(between, rank, axis=1)[:, rank].clip(min=0.0)
     return float(np.quantile(np.sqrt(near), NEARLY_ALL))
+
+
+def learned_range(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest value of every element up to which its relations are known, shapes (size,).
+
+    They are [standard deviations] those of the training data and of the update, with a margin, or those of the normal
+    samples, whichever reach further.
+    """
+    low, high = schema.scaler.normalise(np.stack([schema.scaler.low, schema.scaler.high]))
+    if schema.certainty is not None:
+        low, high = schema.certainty.low, schema.certainty.high
+    room = MARGIN * (high - low)
+    low, high = low - room, high + room
+    if schema.normal is not None and len(schema.normal.rows):
+        rows = schema.normal.rows[:, : schema.layout.size]
+        low, high = np.fmin(low, np.fmin.reduce(rows)), np.fmax(high, np.fmax.reduce(rows))
+    return low, high

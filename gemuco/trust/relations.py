@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
-from gemuco.intervals.sureness import MARGIN
+from gemuco.intervals.region import learned_range
 from gemuco.normal.local import Grid, LocalSize
 from gemuco.normal.watch import error_growth, without_features
 from gemuco.schema import BodySchema
@@ -331,20 +331,3 @@ def _removal(spread: np.ndarray, own: np.ndarray, outside: np.ndarray) -> np.nda
     if kept.any():
         result[np.ix_(kept, kept)] = np.linalg.inv(spread[np.ix_(own[kept], own[kept])])
     return result
-
-
-def learned_range(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
-    """Return lowest and highest value of every element up to which its relations are known, shapes (size,).
-
-    They are [standard deviations] those of the training data and of the update, with a margin, or those of the normal
-    samples, whichever reach further.
-    """
-    low, high = schema.scaler.normalise(np.stack([schema.scaler.low, schema.scaler.high]))
-    if schema.certainty is not None:
-        low, high = schema.certainty.low, schema.certainty.high
-    room = MARGIN * (high - low)
-    low, high = low - room, high + room
-    if schema.normal is not None and len(schema.normal.rows):
-        rows = schema.normal.rows[:, : schema.layout.size]
-        low, high = np.fmin(low, np.fmin.reduce(rows)), np.fmax(high, np.fmax.reduce(rows))
-    return low, high

@@ -10,7 +10,7 @@ import numpy as np
 
 from gemuco.anomaly.prediction import judgements
 from gemuco.anomaly.score import Deviation, deviation_of
-from gemuco.anomaly.verdict import Verdict, judge, window_score
+from gemuco.anomaly.verdict import HARMLESS, Verdict, judge, window_score
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers
 from hal.clock import Clock
@@ -188,7 +188,8 @@ class AnomalyWatch:
     def _steady(self, since: float, verdict: Verdict) -> Verdict:
         """Return the verdict with the element that was blamed before, unless two verdicts in a row blame another."""
         before = self._judged
-        if before is None or before.since != since or not before.verdict.blamed or not verdict.blamed:
+        is_first = before is None or before.since != since or before.verdict.kind != verdict.kind
+        if before is None or is_first or not before.verdict.blamed or not verdict.blamed:
             self._rival = ""
             return verdict
         blamed = before.verdict.blamed
@@ -211,7 +212,7 @@ class AnomalyWatch:
             cycle=cycle,
             score=deviation.distance,
             threshold=deviation.threshold,
-            is_anomaly=is_known and has_lasted and kind not in ("environment", "normal", UNKNOWN),
+            is_anomaly=is_known and has_lasted and kind not in HARMLESS,
             blamed=blamed if is_known else "",
             elements=elements,
             contribution=Numbers(deviation.contribution, elements),

@@ -11,12 +11,12 @@ import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.estimation import fill, recipes
+from gemuco.intervals.region import learned_range
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from gemuco.trust.aligned import Aligned
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
-from gemuco.trust.relations import learned_range
 from hal.by_signal import Numbers
 from hal.clock import Clock
 from hal.config import RobotConfig

@@ -170,9 +170,10 @@ def _anomaly(snapshot: RobotSnapshot) -> Text:
     judged = verdict(snapshot)
     if judged is None or not math.isfinite(judged.score):
         return Text("anomaly: not judged")
-    level = Level.NOTE if judged.kind in ("environment", "unknown") else Level.GOOD
+    level = Level.NOTE if judged.kind in ("environment", "unknown", "outside") else Level.GOOD
     level = Level.ANOMALY if judged.is_anomaly else level
-    state = "; normal is not known on this body yet" if judged.kind == "unknown" else ""
+    words = {"unknown": "; normal is not known on this body yet", "outside": "; outside of what was learned"}
+    state = words.get(judged.kind, "")
     return Text(f"anomaly: score {judged.score:.1f}, threshold {judged.threshold:.1f}{state}", style=STYLES[level])
 
 

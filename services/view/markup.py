@@ -150,8 +150,13 @@ def anomaly_html(snapshot: RobotSnapshot) -> str:
     if judged is None or not math.isfinite(judged.score):
         text = "Not judged: no score arrives, or the model has no normal data."
         return page(f'<div style="min-height:30px" class="dim">{text}</div>')
-    kind = {"anomaly": "lost", "environment": "poor", "unknown": "dim"}.get(judged.kind, "good")
-    words = {"": "nothing to judge", "environment": "environment changed", "unknown": "normal not known on this body"}
+    kind = {"anomaly": "lost", "environment": "poor", "unknown": "dim", "outside": "dim"}.get(judged.kind, "good")
+    words = {
+        "": "nothing to judge",
+        "environment": "environment changed",
+        "unknown": "normal not known on this body",
+        "outside": "outside of what was learned",
+    }
     word = words.get(judged.kind, judged.kind)
     blamed = f"most likely wrong: {judged.blamed or 'not known yet'}" if judged.is_anomaly else ""
     score = f'score <b>{judged.score:.1f}</b> <span class="dim">threshold</span> {judged.threshold:.1f}'

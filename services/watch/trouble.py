@@ -41,12 +41,12 @@ class AnomalyVerdict:
     """Anomaly verdict of the model.
 
     Attributes:
-        kind: `normal`, `environment`, `anomaly`, `unknown` while what is normal was not learned on this body, or empty
-            while there is nothing to judge.
+        kind: `normal`, `environment`, `anomaly`, `unknown` while what is normal was not learned on this body, `outside`
+            of what was learned, or empty while there is nothing to judge.
         score: Anomaly score; NaN if it is not known.
         threshold: Score above which the body is not normal; NaN if it is not known.
         is_anomaly: Whether the score has been above the threshold for as long as the robot file requires.
-        blamed: Element or part that is most likely wrong.
+        blamed: Element or part that is most likely wrong, or that is furthest outside of its learned range.
     """
 
     kind: str
@@ -197,6 +197,9 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     elif judged.kind == "environment":
         text = f"Another condition of the body explains what is measured.{score}"
         yield Trouble(Level.NOTE, "Environment changed", text)
+    elif judged.kind == "outside":
+        text = f"{judged.blamed} is outside of its learned range; larger errors are to be expected there.{score}"
+        yield Trouble(Level.NOTE, "Outside of what was learned", text)
     elif judged.is_anomaly:
         yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'not known yet'}.{score}")
 

@@ -259,12 +259,14 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
         score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
         threshold: Score above which it counts as an anomaly.
         is_anomaly: Whether the score was above the threshold for as long as the robot file requires, and the cause is
-            not a change of environment.
+            neither a change of environment nor a place outside of what was learned.
         blamed: `signal.element` that is most likely wrong in the samples above the threshold; below the threshold, the
-            one that contributes most; empty while the verdict is `unknown`.
+            one that contributes most; with the verdict `outside` the one that is furthest outside of its learned range;
+            empty while the verdict is `unknown`.
         verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
             `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet, or p is beyond
-            the trained conditions), or empty before a verdict.
+            the trained conditions), `outside` (the samples are outside of what was learned, and their errors as large
+            as is to be expected there), or empty before a verdict.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 

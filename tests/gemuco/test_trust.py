@@ -8,6 +8,7 @@ import pytest
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.anomaly.prediction import judging_masks
 from gemuco.dataset import as_dataset
+from gemuco.intervals.region import learned_range
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
@@ -17,7 +18,7 @@ from gemuco.trust.config import BLOCK, TrustConfig
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import Cause, explain
 from gemuco.trust.monitor import TrustMonitor
-from gemuco.trust.relations import Relations, learned_range, rows_of
+from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensitivity
 
 SAMPLES = 5

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from muscle_arm import HIGH, LOW, MOST, MuscleArm
 from tool_arm import ToolArm, dataset, tools
 
 from gemuco.anomaly.blame import parts, suspects
@@ -95,3 +96,35 @@ def test_a_joint_sensor_that_is_off_is_blamed_itself(schema, arm):
 def test_a_part_has_a_name_in_several_signals(schema, grips):
     assert parts(schema, list(range(12))) == [(2 + i, 7 + i) for i in range(5)]
     assert parts(grips, list(range(6))) == []  # `x` and `0` are no names
+
+
+def beyond(arm: MuscleArm, share: float, seed: int) -> dict[str, np.ndarray]:
+    """Samples of a healthy arm that turns its shoulder further than in the data, by a share of the learned range."""
+    random = np.random.default_rng(seed)
+    theta = random.uniform(LOW, HIGH, (10, 2))
+    theta[:, 0] = HIGH[0] + share * (HIGH[0] - LOW[0]) + random.uniform(-0.02, 0.02, 10)
+    tension = random.uniform(2.0, MOST, (10, 5))
+    return {"joint_position": theta, "muscle_tension": tension, "muscle_length": arm.length(theta, tension)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_a_healthy_body_outside_of_what_was_learned_is_no_anomaly(schema, arm, share, seed):
+    samples = rows(beyond(arm, share, seed))
+    assert window_score(schema, schema.normalise(beyond(arm, share, seed))) > 1.0
+    found = judge(schema, samples)
+    assert (found.kind, found.blamed) == ("outside", "joint_position.shoulder")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_a_sensor_that_lies_outside_of_what_was_learned_is_an_anomaly(schema, arm, share):
+    values = beyond(arm, share, 3)
+    values["muscle_length"][:, 1] += 0.06  # m
+    assert judge(schema, rows(values)).kind == "anomaly"
+
+
+def test_a_joint_sensor_that_shows_a_place_outside_of_what_was_learned_is_an_anomaly(schema, arm):
+    values = arm.sample(10, 80)
+    values["joint_position"][:, 0] = HIGH[0] + 0.5  # rad
+    found = judge(schema, rows(values))
+    assert (found.kind, found.blamed) == ("anomaly", "joint_position.shoulder")

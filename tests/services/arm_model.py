@@ -30,8 +30,11 @@ def states(count: int = 3000, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 @cache
-def small_model() -> BodySchema:
+def small_model(most: float = np.inf) -> BodySchema:
+    """Train on the states in which the first joint is at most at an angle [rad]."""
     rows = states()
+    kept = rows["joint_position"][:, 0] <= most
+    rows = {name: values[kept] for name, values in rows.items()}
     layout = layout_of(arm())
     parts = np.split(np.arange(len(rows["joint_position"])), 10)
     dataset = Dataset(layout, tuple(Episode("", {name: value[part] for name, value in rows.items()}) for part in parts))

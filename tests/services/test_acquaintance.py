@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from arm_model import arm, sample_of, small_model
+from arm_model import arm, sample_of, small_model, states
 from msgspec.structs import replace
 
 from hal.clock import ManualClock
@@ -100,3 +100,21 @@ def test_a_small_shift_that_lasts_becomes_an_anomaly() -> None:
     bench.acquaintance.learned(bench.schema)
     bench.watch.tick()
     assert not bench.published[-1].is_anomaly, "a verdict ends with the statistics that it came from"
+
+
+def test_a_place_that_was_not_learned_is_no_anomaly_and_a_lie_there_is() -> None:
+    joint = states()["joint_position"][:, 0]
+    middle, most = np.quantile(joint, [0.5, 0.9])
+    bench = Bench()
+    bench.schema = small_model(middle)
+    bench.acquaintance.learned(bench.schema)
+    for index in np.flatnonzero(joint <= middle)[:10]:
+        assert bench.turn(index).verdict in ("", "normal")
+    away = [bench.turn(index) for index in np.flatnonzero(joint > most)[:30]]
+    assert all(state.score > state.threshold for state in away)
+    assert not any(state.is_anomaly for state in away)
+    assert {state.verdict for state in away[5:]} == {"outside"}
+    assert {state.blamed for state in away[5:]} == {f"joint_position.{arm().signals['joint_position'].elements[0]}"}
+    lies = [bench.turn(index, off=400.0) for index in np.flatnonzero(joint > most)[30:60]]
+    assert lies[-1].is_anomaly
+    assert lies[-1].verdict == "anomaly"

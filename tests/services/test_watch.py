@@ -96,6 +96,7 @@ ENDED = {"hal": Newest(Status(service="hal", state="running"), 9.0)}
         (seen(), Level.GOOD, "Healthy"),
         (seen(anomaly=Newest(anomaly("anomaly"), 0.0)), Level.ANOMALY, "Anomaly"),
         (seen(anomaly=Newest(anomaly("environment"), 0.0)), Level.NOTE, "Environment changed"),
+        (seen(anomaly=Newest(anomaly("outside"), 0.0)), Level.NOTE, "Outside of what was learned"),
         (seen(alive=frozenset({"hal"}), estimate=None), Level.TROUBLE, "Model service gone"),
         (seen(estimate=Newest(estimates(), 3.0)), Level.TROUBLE, "Model service silent"),
         (seen(alive=frozenset({"model"})), Level.DEGRADED, "HAL service gone"),
