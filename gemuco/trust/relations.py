@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.anomaly.prediction import with_bias
+from gemuco.anomaly.prediction import judging_masks, with_bias
+from gemuco.intervals.beyond import line_of
 from gemuco.intervals.region import learned_range
 from gemuco.normal.local import Grid, LocalSize
 from gemuco.normal.watch import error_growth, without_features
@@ -16,6 +17,10 @@ from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import LINEAR, Sensed, Sensitivity
 
+STRAIGHT, CURVED, FURTHEST = 2.0, 6.0, 5.0
+"""Outside of the learned range of an element, by a share of it, the network's errors are larger by the exponential of
+the first multiple of the share if all outputs are linear, else of the second; the share counts up to the third number.
+"""
 NEARBY = 0.05
 """The network's errors are computed anew if a hidden element is off by more than this [standard deviations]."""
 KEPT = 64
@@ -110,6 +115,7 @@ class Relations:
         rows = schema.normal.rows.astype(float)
         self._rows, self._known = self.features(rows), rows
         self.sensitivity = Sensitivity(schema, self.columns)
+        self._steepness = STRAIGHT if _is_linear(schema) else CURVED
         self._sensed = self.sensitivity.sense(schema, rows)
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
@@ -253,9 +259,27 @@ class Relations:
             spread = spread * relation.calibration * np.maximum(1.0, growth) * by_network
             spread = np.maximum(spread, self._coarse)
             better = relation.network & np.isfinite(spread)
+            spread *= self._outside(schema, values, errors, np.where(better, lies, errors))
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
             size = np.where(better, by_network, size)
         return errors, healthy, size
+
+    def _outside(self, schema: BodySchema, values: np.ndarray, *errors: np.ndarray) -> np.ndarray:
+        """Return how much larger the network's errors are at samples outside of the learned ranges, shape (n, 1).
+
+        A sample is outside if the others predict an element there too; a sensor that only shows such a value says
+        nothing of the body.
+
+        Args:
+            schema: The schema.
+            values: Values of the judged columns [standard deviations], shape (n, columns).
+            errors: Their errors in each way to predict them, shape (n, columns).
+        """
+        low, high = (edge[self.columns[: self.count]] for edge in schema.derived(learned_range))
+        places = (values - np.stack([np.zeros(values.shape), *errors]))[..., : self.count]
+        over = np.fmax((low - places).min(axis=0), (places - high).min(axis=0)) / (high - low)
+        share = np.nan_to_num(over).clip(0.0, FURTHEST).max(axis=1, initial=0.0, keepdims=True)
+        return np.asarray(np.exp(self._steepness * share))
 
     def _sensed_without(
         self, schema: BodySchema, hidden: Hidden, errors: np.ndarray, sensed: Sensed, values: np.ndarray
@@ -305,6 +329,12 @@ class Relations:
 def rows_of(schema: BodySchema, x: np.ndarray) -> np.ndarray:
     """Return samples [standard deviations], shape (n, size), followed by the schema's p."""
     return with_bias(schema, x)
+
+
+def _is_linear(schema: BodySchema) -> bool:
+    """Whether every output is linear under the mask that judges it."""
+    lines = ((name, line_of(schema, mask)) for name, mask in schema.derived(judging_masks).items())
+    return all(line is not None and set(schema.layout.indices([name])) <= set(line.outputs) for name, line in lines)
 
 
 def _signal_spreads(schema: BodySchema, rows: np.ndarray, columns: np.ndarray, signal: np.ndarray) -> np.ndarray:

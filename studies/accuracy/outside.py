@@ -5,6 +5,8 @@
 The models and rows are those of `studies.accuracy.certainty`: states with a joint in the half of its range that was not
 learned, another trajectory, or the last part of a recording. Windows of ten successive rows outside are judged as they
 are, and with a lie: one element, drawn at random, is off by `LIE` in all of them.
+
+The second table is of the test for lying sensors in healthy motion, half of which is in the unknown half of a joint.
 """
 
 import argparse
@@ -18,11 +20,17 @@ from rich.table import Table
 from gemuco.anomaly.verdict import judge
 from gemuco.anomaly.window import scores
 from gemuco.schema import BodySchema
+from gemuco.trust.config import BLOCK
+from gemuco.trust.monitor import TrustMonitor
 from studies.accuracy.certainty import Case, cases, train
+from studies.bodies.lying_robots import NOISE, RATE, motion_of
 from studies.peers.question import MissingData
+from studies.peers.robots import robot_of
 
 LENGTH, MOST = 10, 40
 """Rows of a window, and largest number of windows of a condition."""
+TOOLS, PART = 3, round(BLOCK * RATE)
+"""Number of tools, and samples of a block of the second table."""
 LIE = 1.0
 """A wrong element is off by this [standard deviations]."""
 
@@ -52,6 +60,23 @@ def verdicts(case: Case, seed: int) -> tuple[float, Counter[str], Counter[str]]:
             wrong[:, element] += random.choice([-LIE, LIE]) * under.scaler.std[element]
             lying[_kind(under, wrong)] += 1
     return float(np.mean(above)), healthy, lying
+
+
+def wrong_verdicts(case: Case, seed: int) -> tuple[int, float]:
+    """Train, and return how many right elements are hidden in motion with three tools, and its length [min]."""
+    name = case.name.partition(",")[0]
+    schema, _ = train(case, case.trial(seed), seed)
+    robot, number, blocks = robot_of(name), 0, 0
+    for index, condition in enumerate(list(robot.conditions)[:TOOLS]):
+        under = schema.under(condition)
+        motion = motion_of(name, robot, condition, 100 + index)
+        samples = under.scaler.normalise(under.layout.join(motion))
+        monitor, before = TrustMonitor(under), frozenset[int]()
+        for part in np.split(samples, np.arange(PART, len(samples), PART)):
+            monitor.add(part, blocks * BLOCK)
+            number += len(monitor.hidden - before)
+            before, blocks = monitor.hidden, blocks + 1
+    return number, blocks * BLOCK / 60.0
 
 
 def _threshold(schema: BodySchema) -> float:
@@ -91,4 +116,14 @@ if __name__ == "__main__":
         healthy = sum((result[1] for result in results), Counter[str]())
         lying = sum((result[2] for result in results), Counter[str]())
         table.add_row(case.name, f"{share:.0%}", _words(healthy), _words(lying))
+    Console(width=150).print(table)
+    table = Table("body", "right elements hidden", "healthy motion")
+    for case in cases():
+        if (
+            case.name.endswith("half of a joint")
+            and case.name.partition(",")[0] in NOISE
+            and arguments.rows in case.name
+        ):
+            numbers, minutes = zip(*(wrong_verdicts(case, seed) for seed in range(arguments.seeds)), strict=True)
+            table.add_row(case.name, str(sum(numbers)), f"{sum(minutes):.0f} min")
     Console(width=150).print(table)

@@ -71,7 +71,8 @@ def _forecast(robot: RobotConfig, condition: str, postures: np.ndarray) -> Rows:
     return {signal: np.asarray(rows[signal], float) for signal in layout_of(robot).names}
 
 
-def _motion(name: str, robot: RobotConfig, condition: str, seed: int) -> Rows:
+def motion_of(name: str, robot: RobotConfig, condition: str, seed: int) -> Rows:
+    """Return noisy samples of random motion with a tool."""
     start, commands = _postures(robot, condition, 1, seed)[0], []
     for command, hold in random_postures(robot, collect_config(robot), condition, seed)(start):
         commands += [command] * max(1, round(hold * RATE))
@@ -91,7 +92,7 @@ def _with_tools(name: str, fit: Callable, config: Callable, learn: Callable) -> 
     units = {signal.name: signal.unit for signal in layout_of(robot).signals}
     outputs = (TIP,) if name == "pr2_duster" else None
     schema, _ = fit(train, train_config(model, model.training.epochs, 0), MASKS[name], x_out=outputs, units=units)
-    return schema, {c: _motion(name, robot, c, 100 + i) for i, c in enumerate(robot.conditions)}
+    return schema, {c: motion_of(name, robot, c, 100 + i) for i, c in enumerate(robot.conditions)}
 
 
 def _arm(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
