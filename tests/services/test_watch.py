@@ -9,7 +9,7 @@ from rich.console import Console
 from talking_robot import BOTH, anomaly, estimates, sample, seen
 
 from services.verbs import top
-from services.view.markup import signals_html
+from services.view.markup import anomaly_html, signals_html
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
 from services.watch.snapshot import Newest, RobotSnapshot
@@ -182,3 +182,20 @@ def test_top_shows_troubles_signals_and_a_robot_without_a_model():
     assert "Model service gone: Only measured values are known. Is `gemuco serve` running?" in text
     row = next(line for line in text.splitlines() if "joint_position" in line and "1/2" in line)
     assert "0.250 nan" in row
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [("outside", "outside of what was learned"), ("unknown", "not known on this body"), ("environment", "changed")],
+)
+def test_the_page_says_a_verdict_that_is_no_anomaly_and_blames_nothing(kind, words):
+    page = anomaly_html(seen(anomaly=Newest(anomaly(kind), 0.0)))
+    assert words in page
+    assert "most likely wrong" not in page
+
+
+def test_the_terminal_says_that_the_body_is_outside_of_what_was_learned():
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(top.view(seen(anomaly=Newest(anomaly("outside"), 0.0))))
+    assert "threshold 20.0; outside of what was learned" in shown.get()
