@@ -7,9 +7,9 @@ follows from the closed-form predictions of single elements (`gemuco.intervals.r
 import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
-from gemuco.derived import ByPattern
 from gemuco.intervals.region import learned_range
 from gemuco.intervals.regression import Fit
+from gemuco.normal.watch import PATTERNS
 from gemuco.schema import BodySchema
 
 EXPECTED, FOLLOWED = 6.0, 24.0
@@ -33,7 +33,7 @@ def outside(schema: BodySchema, rows: np.ndarray) -> str:
     """
     whole, (low, high) = with_bias(schema, rows), learned_range(schema)
     furthest, most = "", 0.0
-    for fit in schema.derived(_fits)(np.isfinite(rows).all(axis=0)):
+    for fit in _fits(schema, np.isfinite(rows).all(axis=0)):
         place, features = fit.elements[0], fit.reading.features(whole)
         values = np.array([rows[:, place], features @ fit.maps[:, 0]]).mean(axis=1)
         over = float(max((low[place] - values).min(), (values - high[place]).min()) / (high[place] - low[place]))
@@ -45,12 +45,20 @@ def outside(schema: BodySchema, rows: np.ndarray) -> str:
     return furthest
 
 
-def _fits(schema: BodySchema) -> ByPattern[list[Fit]]:
-    """Return the prediction of every measured element from all other measured ones, by the measured elements."""
+def _fits(schema: BodySchema, finite: np.ndarray) -> list[Fit]:
+    """Return the prediction of every measured element from all other measured ones, which W and p do not change.
 
-    def of(finite: np.ndarray) -> list[Fit]:
+    Args:
+        schema: The body schema.
+        finite: Whether each element is measured, shape (size,).
+    """
+    normal, key = schema.normal, ("alone", finite.tobytes())
+    if normal is None:
+        return []
+    if key not in normal.known:
         places = np.arange(len(finite))
         fits = (Fit.of(schema, finite & (places != place)) for place in np.flatnonzero(finite))
-        return [fit for fit in fits if fit is not None]
-
-    return ByPattern(of)
+        if len(normal.known) >= PATTERNS:
+            normal.known.clear()
+        normal.known[key] = [fit for fit in fits if fit is not None]
+    return list(normal.known[key])

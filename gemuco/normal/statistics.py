@@ -120,6 +120,8 @@ class Normal:
     bound: float = 1.0
     shrink: float = SHRINK
     usual: int = field(init=False, repr=False)
+    known: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Values that other rooms compute from these statistics alone, so that they outlast a change of W or p."""
     _precisions: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:

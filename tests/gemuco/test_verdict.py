@@ -6,6 +6,7 @@ from tool_arm import ToolArm, dataset, tools
 from gemuco.anomaly.blame import parts, suspects
 from gemuco.anomaly.prediction import predict_error
 from gemuco.anomaly.verdict import judge, window_score
+from gemuco.intervals.regression import Fit
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal import Normal
@@ -128,3 +129,12 @@ def test_a_joint_sensor_that_shows_a_place_outside_of_what_was_learned_is_an_ano
     values["joint_position"][:, 0] = HIGH[0] + 0.5  # rad
     found = judge(schema, rows(values))
     assert (found.kind, found.blamed) == ("anomaly", "joint_position.shoulder")
+
+
+def test_the_predictions_of_single_elements_outlast_a_change_of_the_model(schema, arm, monkeypatch):
+    samples = rows(beyond(arm, 0.5, 0))
+    assert judge(schema, samples).kind == "outside"
+    monkeypatch.setattr(Fit, "of", None)  # would be computed at every step of an online update
+    updated = schema.with_weights(schema.weights.replaced([array.copy() for array in schema.weights.arrays()]))
+    updated.prepare(schema)
+    assert judge(updated, samples).kind == "outside"
