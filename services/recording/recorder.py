@@ -36,6 +36,7 @@ COMMIT_EVERY = 0.4
 DESCRIBED_WITHIN = 0.5
 """Without a robot file, writing waits at most this long [s] for the HAL to name its signals."""
 ASK_WITHIN = 1.0
+SILENT = "No message of robot '{}' has arrived: is its name right, and is a service of it running?"
 LEAST_STEP = 500_000_000
 """A jump of the wall clock by at least this [ns] is reported."""
 
@@ -120,11 +121,14 @@ class Recorder:
         self.writer = writer
         self.failure = ""
         """Reason why writing ended early; empty otherwise."""
-        self._session, self._robot = session, robot
+        self._session, self.robot = session, robot
         self._waiting = EntryQueue(limit, MOST_BYTES)
         self._clock = SteadyClock()
         self._stop = threading.Event()
         self._has_new_hal = threading.Event()
+        self._own_status = keys.status(robot, "recorder")
+        self.is_heard = False
+        """Whether a message of one of the robot's other services has arrived."""
         self._is_described = threading.Event()
         if is_described:
             self._is_described.set()
@@ -135,7 +139,7 @@ class Recorder:
         self._asking = threading.Thread(target=self._describe, name="ask the HAL", daemon=True)
         self._writing.start()
         self._asking.start()
-        session, robot = self._session, self._robot
+        session, robot = self._session, self.robot
         self._subscriber = session.declare_subscriber(keys.everything(robot), self._receive)
         self._tokens = session.liveliness().declare_subscriber(
             keys.alive(robot, "*"), self._receive_token, history=True
@@ -168,14 +172,15 @@ class Recorder:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         """Queue a message with its arrival; runs in zenoh's thread and never blocks."""
-        now = self._clock.now_ns()
-        self._waiting.put(Entry("message", str(sample.key_expr), now, sample.payload.to_bytes(), str(sample.encoding)))
+        now, key = self._clock.now_ns(), str(sample.key_expr)
+        self.is_heard = self.is_heard or key != self._own_status
+        self._waiting.put(Entry("message", key, now, sample.payload.to_bytes(), str(sample.encoding)))
 
     def _receive_token(self, sample: zenoh.Sample) -> None:
         is_alive = sample.kind == zenoh.SampleKind.PUT
         key = str(sample.key_expr)
         self._waiting.put(Entry("alive" if is_alive else "gone", key, self._clock.now_ns()))
-        if is_alive and key == keys.alive(self._robot, "hal"):
+        if is_alive and key == keys.alive(self.robot, "hal"):
             self._has_new_hal.set()
 
     def _describe(self) -> None:
@@ -183,7 +188,7 @@ class Recorder:
         while self._has_new_hal.wait() and not self._stop.is_set():
             self._has_new_hal.clear()
             with contextlib.suppress(ServiceError):  # not allowed, or ended again: then signals have numbers for names
-                description = query.ask(self._session, keys.verb(self._robot, "hal", "describe"), timeout=ASK_WITHIN)
+                description = query.ask(self._session, keys.verb(self.robot, "hal", "describe"), timeout=ASK_WITHIN)
                 self._waiting.put(Entry("robot", "", self._clock.now_ns(), description=description))
             self._is_described.set()
 
@@ -313,12 +318,13 @@ def run_recorder(
 def summary(recorder: Recorder, seconds: float) -> str:
     """Return sentences on the recorded and the missing messages."""
     counters = recorder.counters()
+    lack = missing(counters) if recorder.is_heard else SILENT.format(recorder.robot)
     files = recorder.writer.paths
     place = (
         f"{files[0]}" + (f" to {files[-1].name} ({len(files)} files)" if len(files) > 1 else "") if files else "no file"
     )
     text = f"{counters['written']} messages, {seconds:.1f} s, {counters['bytes'] / 1e6:.2f} MB in {place}."
-    return f"{text} {missing(counters)} {counters['failure']}".rstrip()
+    return f"{text} {lack} {counters['failure']}".rstrip()
 
 
 def missing(counters: Mapping[str, Any]) -> str:
@@ -335,7 +341,8 @@ def missing(counters: Mapping[str, Any]) -> str:
 def _status(recorder: Recorder) -> Status:
     counters = recorder.counters()
     lost = counters["dropped"] + counters["missed"]
-    text = counters["failure"] or (f"{lost} messages are missing from the recording." if lost else "")
+    silent = "" if recorder.is_heard else SILENT.format(recorder.robot)
+    text = counters["failure"] or (f"{lost} messages are missing from the recording." if lost else silent)
     return Status(
         stamp_ns=time.time_ns(),
         service="recorder",

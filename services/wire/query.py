@@ -20,6 +20,7 @@ import zenoh
 from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.errors import NoAnswer, RemoteError, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
+from services.runtime import services_here
 from services.wire import keys
 from services.wire.caller import CURRENT_CALLER, LONGEST_NAME, UNKNOWN, Caller
 from services.wire.messages import MAX_BYTES, UNREADABLE, VERSION, MessageError
@@ -279,12 +280,21 @@ def starter(service: str) -> str:
 def describe_presence(session: zenoh.Session, robot: str) -> str:
     """Describe the services that are visible although the queried one is not: a sentence that begins with a space."""
     if not session.info.transports():
-        return " At the moment this program has no connection: no router, and no service of the robot."
+        return f" At the moment this program has no connection: no router, and no service of the robot.{_here(robot)}"
     if services := alive(session, robot):  # first alone: a role may not see other robots
         return f" Running services of this robot: {', '.join(sorted(services))}."
     if others := sorted(_running(session)):
         return f" There is no robot '{robot}'. Visible robots: {', '.join(others)}."
     return " The router runs, but no robot is visible."
+
+
+def _here(robot: str) -> str:
+    """Return the other robots of this machine, whose name may have been meant: a sentence, or empty."""
+    try:
+        others = sorted({name for name, _ in services_here() if name != robot})
+    except ServiceError:  # no folder of locks, which a client does not need
+        return ""
+    return f" Robots on this machine: {', '.join(others)}." if others else ""
 
 
 def _no_answer(session: zenoh.Session, key: str, timeout: float, late: bool) -> NoAnswer:

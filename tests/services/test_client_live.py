@@ -261,6 +261,12 @@ def test_a_robot_that_is_not_there_is_told_with_those_that_are(robot: str, route
                 near.ask("model", "engage", timeout=0.2)
 
 
+def test_a_wrong_name_without_a_router_is_answered_with_the_robots_of_this_machine(robot: str) -> None:
+    says = rf"has no connection.* Robots on this machine: (.*, )?{robot}[,.]"
+    with Service(robot, "hal"), Client(f"{robot}_x") as near, pytest.raises(ServiceUnavailable, match=says):
+        near.ask("hal", "describe", timeout=0.2)
+
+
 @pytest.mark.slow
 def test_no_router_is_told_at_once(robot: str, tmp_path: Path) -> None:
     with pytest.raises(ServiceUnavailable, match="gemuco router"):

@@ -261,6 +261,15 @@ def test_a_recording_never_replaces_a_file(robot: str, tmp_path: Path) -> None:
     assert path.read_text() == "precious"
 
 
+def test_a_recording_of_a_silent_robot_says_so(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stop = threading.Event()
+    threading.Timer(1.5, stop.set).start()  # one status of the recorder itself is recorded
+    assert run_recorder(robot, tmp_path / "run.mcap", stop=stop) == 0
+    text = capsys.readouterr().out
+    assert f"No message of robot '{robot}' has arrived" in text
+    assert "Nothing is missing" not in text
+
+
 def test_a_file_that_cannot_be_written_is_told(robot: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="cannot be written: "):
