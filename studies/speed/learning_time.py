@@ -1,6 +1,6 @@
 """Time of data collection, structure determination and training of the three robots' models.
 
-    python -m studies.accuracy.learning_time [--samples 500]
+    python -m studies.speed.learning_time [--samples 500]
 
 Collection is without a bus, one condition, best of three runs, in times real time by the wall clock and by CPU time.
 Training is on the data of `gemuco collect` in runs/<robot>/data.npz; missing data are collected first and not counted.
