@@ -92,7 +92,7 @@ def learn_normal(
         near = _apart(complete, elements)
     elif weight:
         near = neighbours.nearness(neighbours.neighbourhood(cloud, elements), complete)
-    normal = Normal.fit(errors, spread, false_alarm, near, weight, shrink)
+    normal = Normal.fit(errors, spread, false_alarm, near, weight, shrink, complete[:, : schema.layout.size])
     return replace(normal, watch=watch, rows=kept, cloud=cloud.astype(np.float32) if weight else normal.cloud)
 
 

@@ -67,6 +67,8 @@ def window_score(schema: BodySchema, rows: np.ndarray) -> float:
     normal = schema.normal
     if normal is None or not len(rows):
         return float("nan")
+    if normal.windows is not None:
+        rows = rows[-normal.windows.longest :]
     judged = [window for window in groups(schema, rows) if len(window.by.judged.place)]
     if not judged:
         return float("nan")
@@ -80,9 +82,10 @@ def window_score(schema: BodySchema, rows: np.ndarray) -> float:
     known = np.isfinite(distances)
     if normal.windows is None or normal.scale is None:
         return float(np.sqrt(np.mean((distances[known] / thresholds[known]) ** 2)))
-    share = float(np.exp(normal.scale.std * normal.windows.excess(deviations[known])))
+    place = normal.windows.place(int(known.sum()), rows[known])
+    share = float(np.exp(normal.scale.std * normal.windows.excess(deviations[known], place)))
     if len(judged) == 1 and judged[0].by.is_complete:
         index, errors = judged[0].by.judged.place, judged[0].errors
         away = (errors[:, index] - normal.mean[index]) / np.sqrt(np.diag(normal.covariance)[index])
-        share = max(share, float(np.exp(normal.scale.std * normal.windows.shifted(away))))
+        share = max(share, float(np.exp(normal.scale.std * normal.windows.shifted(away, place))))
     return share

@@ -14,6 +14,8 @@ LARGEST_ERROR = 100.0
 that is always the mean has 1."""
 LARGEST_LIMIT = 50.0
 """A limit of deviations is at most this number of standard deviations; those of learned models are below 6."""
+LARGEST_SCATTER = 100.0
+"""Within a window an element varies by at most this multiple of its variance in the training data."""
 ROUNDING = 1e-4
 """Numbers that follow from each other may differ by this share."""
 
@@ -97,6 +99,10 @@ def _windows(windows: Windows) -> Iterator[str]:
             yield f"the {name} of windows are not within 0 and {LARGEST_LIMIT:g}"
     if not ((windows.variance >= 0.9 * SYSTEMATIC) & (windows.variance <= LARGEST_ERROR)).all():
         yield f"the variances of windows are not within {SYSTEMATIC:g} and {LARGEST_ERROR:g}"
+    if windows.scatter is not None:
+        known = windows.scatter[np.isfinite(windows.scatter)]
+        if not ((known >= 0.0) & (known <= LARGEST_SCATTER)).all():
+            yield f"the scatter within windows is not within 0 and {LARGEST_SCATTER:g}"
 
 
 def _watch(watch: Watch, inputs: int) -> Iterator[str]:

@@ -38,8 +38,8 @@ KEPT = 500
 
 
 WATCHED = ("inputs", "signal", "low", "high", "moments", "penalties")
-WINDOWED = ("sizes", "limits", "stds", "variance", "shift", "shift_stds")
-"""Arrays of a watch, and of windows, in the order of their arguments."""
+WINDOWED = ("sizes", "limits", "stds", "variance", "shift", "shift_stds", "scatter")
+"""Arrays of a watch, and of windows, in the order of their arguments; older models lack the last one."""
 
 
 class Scale(NamedTuple):
@@ -136,6 +136,7 @@ class Normal:
         near: np.ndarray | None = None,
         weight: float = 0.0,
         shrink: float = SHRINK,
+        samples: np.ndarray | None = None,
     ) -> "Normal":
         """Compute the statistics of a healthy body.
 
@@ -146,6 +147,7 @@ class Normal:
             near: Distance of every sample from the nearest known samples, shape (samples,).
             weight: Weight of this distance.
             shrink: Share of the covariance that is replaced by its diagonal.
+            samples: The samples themselves [standard deviations], shape (samples, size).
 
         Raises:
             NotEnoughData: Fewer complete samples than errors, or than `LEAST`.
@@ -169,7 +171,7 @@ class Normal:
         mean[seen], part_of = rows.mean(axis=0), covariance_of(rows, spread[seen], shrink)
         covariance[np.ix_(seen, seen)] = part_of
         away = (rows - mean[seen]) / np.sqrt(np.diag(part_of))
-        windows = Windows.fit(deviations, away, false_alarm)
+        windows = Windows.fit(deviations, away, false_alarm, None if samples is None else samples[whole])
         above = float((deviations > windows.limits[0]).mean())
         return cls(
             mean,
@@ -211,7 +213,8 @@ class Normal:
         if self.watch is not None:
             arrays |= {f"watch.{name}": getattr(self.watch, name) for name in WATCHED}
         if self.windows is not None:
-            arrays |= {f"windows.{name}": getattr(self.windows, name) for name in WINDOWED}
+            windowed = {f"windows.{name}": getattr(self.windows, name) for name in WINDOWED}
+            arrays |= {name: array for name, array in windowed.items() if array is not None}
         return arrays
 
     @classmethod
@@ -222,8 +225,8 @@ class Normal:
             inputs, signal, low, high, moments, penalties = (arrays[f"watch.{name}"] for name in WATCHED)
             watch = Watch(inputs, signal, low, high, moments, penalties, facts["count"])
         if scale is not None:
-            sizes, limits, stds, variance, shift, shift_stds = (arrays[f"windows.{name}"] for name in WINDOWED)
-            windows = Windows(sizes, limits, stds, variance, shift, shift_stds)
+            sizes, limits, stds, variance, shift, shift_stds = (arrays[f"windows.{name}"] for name in WINDOWED[:-1])
+            windows = Windows(sizes, limits, stds, variance, shift, shift_stds, arrays.get("windows.scatter"))
         return cls(
             arrays["mean"],
             arrays["covariance"],
@@ -263,6 +266,7 @@ class Normal:
             "windows.stds": (levels,),
             "windows.shift": (levels,),
             "windows.shift_stds": (levels,),
+            "windows.scatter": (levels, size),
         }
         return [(f"normal.{name}", array, right[name]) for name, array in self.arrays().items()]
 

@@ -1,7 +1,9 @@
 """Statistics of windows of consecutive normal samples: how far the mean of n samples of a healthy body may be off.
 
 Neighbouring samples are alike: the mean of n of them varies more than that of n independent ones. So the statistics of
-every n come from windows of n consecutive samples that were not learned from.
+every n come from windows of n consecutive samples that were not learned from. A body that moves less than in these
+windows, or stands still, repeats the same systematic errors: its samples count as the fewer samples over which a moving
+body scatters as much.
 """
 
 import math
@@ -25,6 +27,9 @@ of the motion, even a good model is off by a part of its noise."""
 
 PARTS = 5
 """Shifts of the windows in each of this number of parts of the motion are measured by the windows in the others."""
+
+CALM = 0.1
+"""A window in which the body moves more than in this share of the normal windows counts in full."""
 
 FEWEST = 8.0
 """Fewer independent samples than this count as this many; the tolerance has no finite value below 5."""
@@ -96,6 +101,19 @@ def _shifts(moved: np.ndarray) -> np.ndarray:
     return np.concatenate(shifts)
 
 
+def _scatters(samples: np.ndarray, count: int) -> np.ndarray:
+    """Return the usual variance of every element within windows, shape (n, size) -> (size,).
+
+    It is the mean over the windows, times a factor by which the sum over the elements becomes that of a calm window.
+    """
+    known = np.isfinite(samples).all(axis=0)
+    usual = np.full(samples.shape[1], np.nan)
+    within = (means(samples[:, known] ** 2, count) - means(samples[:, known], count) ** 2).clip(min=0.0)
+    total = within.sum(axis=1)
+    usual[known] = within.mean(axis=0) * float(np.quantile(total, CALM)) / max(float(total.mean()), 1e-12)
+    return usual
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
     """Limits of windows of n samples of a healthy body.
@@ -107,6 +125,9 @@ class Windows:
         variance: Variance of the mean of every error over a window [its single variance], shape (levels, errors).
         shift: Limit of the logarithm of the mean squared shift, a multiple of this variance, shape (levels,).
         shift_stds: Standard deviation of this logarithm in normal windows, shape (levels,).
+        scatter: Variance of every element within a window in which the body moves little [standard deviations of the
+            training data], shape (levels, size), NaN if not known; None in older models, where all windows count in
+            full.
     """
 
     sizes: np.ndarray
@@ -115,15 +136,19 @@ class Windows:
     variance: np.ndarray
     shift: np.ndarray
     shift_stds: np.ndarray
+    scatter: np.ndarray | None = None
 
     @classmethod
-    def fit(cls, deviations: np.ndarray, errors: np.ndarray, false_alarm: float) -> "Windows":
+    def fit(
+        cls, deviations: np.ndarray, errors: np.ndarray, false_alarm: float, samples: np.ndarray | None = None
+    ) -> "Windows":
         """Learn from consecutive normal samples.
 
         Args:
             deviations: Deviation of every sample, shape (n,).
             errors: Its errors [their standard deviations], mean zero, shape (n, errors).
             false_alarm: Share of normal windows that may be above a limit.
+            samples: Its values [standard deviations of the training data], shape (n, size).
         """
         time = correlation_time(deviations)
         sizes, variance = [], []
@@ -143,29 +168,61 @@ class Windows:
                 known.append((limit(values, share, independent, least), max(float(values.std()), least)))
             count *= 2
         above, shifted = np.array(limits), np.array(shifts)
-        return cls(np.array(sizes), above[:, 0], above[:, 1], np.array(variance), shifted[:, 0], shifted[:, 1])
+        scatter = None if samples is None else np.array([_scatters(samples, count) for count in sizes])
+        return cls(np.array(sizes), above[:, 0], above[:, 1], np.array(variance), shifted[:, 0], shifted[:, 1], scatter)
 
-    def excess(self, deviations: np.ndarray) -> float:
-        """Return how far the mean deviation of a window is above its limit [its standard deviations], shape (n,)."""
-        recent = deviations[-int(self.sizes[-1]) :]
-        above = recent.mean() - self._at(len(recent), self.limits)
-        return float(above / self._at(len(recent), self.stds))
+    @property
+    def longest(self) -> int:
+        """Number of samples that are judged; only the last ones of a longer window are."""
+        return int(self.sizes[-1])
 
-    def shifted(self, errors: np.ndarray) -> float:
-        """Return how far the shift of a window is above its limit [its standard deviations], shape (n, errors).
+    def place(self, count: int, samples: np.ndarray) -> float:
+        """Return the logarithm to base 2 of the number of samples that a window counts as.
+
+        Args:
+            count: Number of its judged samples.
+            samples: Their values [standard deviations of the training data], shape (count, size), NaN where not
+                measured.
+        """
+        whole = math.log2(min(count, self.longest))
+        if self.scatter is None or count < 2:
+            return whole
+        known = np.isfinite(samples).all(axis=0) & np.isfinite(self.scatter[-1])
+        usual = np.maximum.accumulate(self.scatter[:, known].sum(axis=1))
+        moved = float(samples[:, known].var(axis=0).sum())
+        level = max(1, int(np.searchsorted(usual, moved, side="right")))
+        if level >= len(usual):
+            return whole
+        return min(whole, max(0.0, level - 1 + (moved - usual[level - 1]) / (usual[level] - usual[level - 1])))
+
+    def excess(self, deviations: np.ndarray, place: float) -> float:
+        """Return how far the mean deviation of a window is above its limit [its standard deviations].
+
+        Args:
+            deviations: Deviations of the samples, shape (n,).
+            place: Its `place`.
+        """
+        above = deviations.mean() - self._at(place, self.limits)
+        return float(above / self._at(place, self.stds))
+
+    def shifted(self, errors: np.ndarray, place: float) -> float:
+        """Return how far the shift of a window is above its limit [its standard deviations].
 
         A single sample has no shift of its own: negative infinity.
-        """
-        recent = errors[-int(self.sizes[-1]) :]
-        if len(recent) < 2 or len(self.sizes) < 2:
-            return -math.inf
-        ratio = recent.mean(axis=0) ** 2 / self._at(len(recent), self.variance)
-        above = np.log(ratio.mean() + 1e-12) - self._at(len(recent), self.shift)
-        return float(above / self._at(len(recent), self.shift_stds))
 
-    def _at(self, count: int, values: np.ndarray) -> np.ndarray:
+        Args:
+            errors: Errors of the samples [their standard deviations], shape (n, errors).
+            place: Its `place`.
+        """
+        if len(errors) < 2 or len(self.sizes) < 2:
+            return -math.inf
+        ratio = errors.mean(axis=0) ** 2 / self._at(place, self.variance)
+        above = np.log(ratio.mean() + 1e-12) - self._at(place, self.shift)
+        return float(above / self._at(place, self.shift_stds))
+
+    @staticmethod
+    def _at(place: float, values: np.ndarray) -> np.ndarray:
         """Return values between two learned sizes, linear in the logarithm of the size."""
-        place = np.log2(min(count, int(self.sizes[-1])))
         low = int(place)
         high = min(low + 1, len(values) - 1)
         return np.asarray(values[low] + (place - low) * (values[high] - values[low]))

@@ -201,7 +201,9 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
         text = f"{judged.blamed} is outside of its learned range; larger errors are to be expected there.{score}"
         yield Trouble(Level.NOTE, "Outside of what was learned", text)
     elif judged.is_anomaly:
-        yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'not known yet'}.{score}")
+        small = " The deviation is small and lasts." if judged.score <= judged.threshold else ""
+        text = f"Most likely wrong: {judged.blamed or 'not known yet'}.{small}{score}"
+        yield Trouble(Level.ANOMALY, "Anomaly", text)
 
 
 def _suspects(snapshot: RobotSnapshot) -> Iterator[Trouble]:

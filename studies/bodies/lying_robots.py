@@ -73,13 +73,17 @@ def _forecast(robot: RobotConfig, condition: str, postures: np.ndarray) -> Rows:
 
 def motion_of(name: str, robot: RobotConfig, condition: str, seed: int) -> Rows:
     """Return noisy samples of random motion with a tool."""
+    return _noisy(name, forecast_of(robot, condition, seed), np.random.default_rng([seed, 5]))
+
+
+def forecast_of(robot: RobotConfig, condition: str, seed: int) -> Rows:
+    """Return the same samples without noise."""
     start, commands = _postures(robot, condition, 1, seed)[0], []
     for command, hold in random_postures(robot, collect_config(robot), condition, seed)(start):
         commands += [command] * max(1, round(hold * RATE))
         if len(commands) >= SECONDS * RATE:
             break
-    rows = _forecast(robot, condition, np.array(commands[: SECONDS * RATE]))
-    return _noisy(name, rows, np.random.default_rng([seed, 5]))
+    return _forecast(robot, condition, np.array(commands[: SECONDS * RATE]))
 
 
 def _with_tools(name: str, fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:

@@ -114,6 +114,8 @@ FORGED = {
     "windows that vary much": (put("normal.windows.variance", 1e30), untouched),
     "windows of size 0": (put("normal.windows.sizes", 0), untouched),
     "shift without limit": (put("normal.windows.shift", 1e30), untouched),
+    "scatter without limit": (put("normal.windows.scatter", 1e30, -1), untouched),
+    "negative scatter": (put("normal.windows.scatter", -1.0, -1), untouched),
     "watch clips all": (clipped, untouched),
     "watch reads beyond": (put("normal.watch.inputs", 10_000, 0), untouched),
     "watch penalised": (put("normal.watch.penalties", 1e30), untouched),

@@ -150,6 +150,12 @@ def test_a_blamed_part_needs_a_verdict():
     assert verdict(seen(anomaly=Newest(anomaly("anomaly"), 0.01))).blamed == "muscle_tension.biceps"
 
 
+def test_an_anomaly_below_the_threshold_of_single_samples_is_explained():
+    large, small = anomaly("anomaly"), replace(anomaly("anomaly"), score=18.7)
+    assert "lasts" not in str(troubles(seen(anomaly=Newest(large, 0.01)), ())[0])
+    assert "small and lasts. Score 18.7, threshold 20.0" in str(troubles(seen(anomaly=Newest(small, 0.01)), ())[0])
+
+
 def test_a_paused_replay_is_shown_as_present():
     status = Status(service="hal", state="running", facts={"replay": {"paused": True}})
     moment = seen(age=9.0, statuses={"hal": Newest(status, 0.5)})
