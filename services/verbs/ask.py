@@ -148,10 +148,26 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
         holder = client.holder()
         return {"holder": holder.name or "none", "left": round(holder.left, 1)}
     if verb == "anomaly":
-        return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
+        return _anomaly(client, hide)
     if verb in ("normal", "rollback"):
         return client.learn_normal() if verb == "normal" else client.rollback()
     return client.ask(WITHOUT_WORDS[verb], verb)
+
+
+def _anomaly(client: Client, hide: Sequence[str]) -> dict[str, Any]:
+    """Return the published judgement with its verdict; with hidden signals, or before the first, a single score."""
+    now = None if hide else client.anomaly(timeout=CONNECTS_WITHIN)
+    if now is None:
+        return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
+    return {
+        "verdict": now.verdict,
+        "is_anomaly": now.is_anomaly,
+        "blamed": now.blamed,
+        "score": now.score,
+        "threshold": now.threshold,
+        "contribution": {name: values.tolist() for name, values in now.contribution.items()},
+        "cycle": now.cycle,
+    }
 
 
 def _target(verb: str, words: Sequence[str]) -> tuple[str, list[float]]:

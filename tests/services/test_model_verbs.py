@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from arm_model import arm, small_model, states
+from talking_robot import TalkingRobot
 
 from gemuco.anomaly.score import score
 from gemuco.errors import NotEnoughData, NotFinite, NotObservable, UnknownSignal, WrongSize
@@ -144,10 +145,19 @@ def test_the_command_line_asks_too(model: GemucoService, robot: str, capsys: pyt
     assert ask_robot(robot, "control", ["joint_position", "0", "0", "0", "-0.6", "0"], (), False, ()) == 0
     assert "signal: muscle_length" in capsys.readouterr().out
     assert ask_robot(robot, "anomaly", [], ["joint_position"], False, ()) == 0
-    assert "score:" in capsys.readouterr().out
+    scored = capsys.readouterr().out
+    assert "score:" in scored
+    assert "verdict:" not in scored, "a single sample has none"
     command = [str(value) for value in states(seed=5)["muscle_length"][3]]
     assert ask_robot(robot, "simulate", command, (), False, ()) == 0
     assert "states:" in capsys.readouterr().out
+
+
+def test_the_command_line_returns_the_verdict_that_is_published(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with TalkingRobot(robot) as talking:
+        talking.verdict = "environment"
+        assert ask_robot(robot, "anomaly", [], (), False, ()) == 0
+    assert "verdict: environment\nis_anomaly: false\n" in capsys.readouterr().out
 
 
 def test_history_holds_what_was_estimated(client: Client, model: GemucoService) -> None:
