@@ -148,6 +148,14 @@ class Updater:
             self._owed = min(self._owed + self._steps_of_a_sample(), float(YOUNG * self.config.steps))
         return True
 
+    def forget(self, count: int) -> None:
+        """Drop this number of the newest samples: a sensor lied in them. W keeps what it learned of them."""
+        if count:
+            self._relearner.window.forget_from(self._relearner.window.added - count)
+            self._pending = self._pending[:-count]
+            for _ in range(min(count, len(self._newest))):
+                self._newest.pop()
+
     def _is_usable(self, x: np.ndarray) -> bool:
         whole = self.schema.layout.whole(np.isfinite(x))
         return any(m <= whole for m in self.schema.masks) and bool(np.isfinite(x[self.schema.out_index]).any())

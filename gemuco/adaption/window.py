@@ -44,6 +44,13 @@ class Window:
         self._serial[old] = -1
         self._learned = None
 
+    def forget_from(self, serial: int) -> None:
+        """Drop the sample with a number, and all newer ones."""
+        new = self._serial >= serial
+        self.dropped += int(new.sum())
+        self._serial[new] = -1
+        self._learned = None
+
     def rows(self) -> np.ndarray:
         """Return all samples, oldest first, shape (n, width)."""
         index = np.flatnonzero(self._serial >= 0)

@@ -19,6 +19,8 @@ CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
 SURE = 2.0
 """Another cause replaces one if its evidence is this multiple."""
+SAME = 0.3
+"""An error and a jump are the same if they differ by less than this share of the jump."""
 MOVES = 3.0
 """Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 
@@ -38,7 +40,9 @@ class Case:
         moved: Their motion [blocks at the usual pace].
         is_hidden: Whether its elements are hidden.
         has_jumped: Whether an element has jumped away, and not yet back.
+        jumped_alone: Whether it is one element that is wrong by as much as it jumped, so the body did not move with it.
         is_plain: Whether an element jumped or was stuck, so that it certainly lied.
+        is_gross: Whether it is much more than an alarm, and all others fit each other.
         may_be_body: Whether the part of the body that its sensors measure may have changed, so that they are right: a
             wire that is cut contradicts the sensors of its neighbours too.
         kind: As in `Finding`.
@@ -56,6 +60,8 @@ class Case:
     moved: float = 0.0
     is_hidden: bool = False
     has_jumped: bool = False
+    jumped_alone: bool = False
+    is_gross: bool = False
     is_plain: bool = False
     may_be_body: bool = False
     kind: str = "unknown"
@@ -113,7 +119,7 @@ class Case:
         """Return what others see of it: positions of its elements in the layout, wrong since this time [s]."""
         return Finding(
             tuple(elements), self.cause.cause, self.kind, since, self.size, self.is_hidden,
-            reason=self.reason, condition=self.cause.condition,
+            reason=self.reason, condition=self.cause.condition, is_gross=self.is_gross,
         )  # fmt: skip
 
 
@@ -183,10 +189,14 @@ def describe(
     position = int(relations.columns[lead])
     std, layout = float(schema.scaler.std[position]), schema.layout
     unit = layout.signal(layout.element(position).partition(".")[0]).unit
-    others = [c for c in columns if c != lead]
+    others = [c for c in columns if c != lead and relations.signals[c] == relations.signals[lead]]
+    if case.has_jumped and len(before := recent.values()[: -len(values) - 1]):
+        jump = values[-1, lead] - before[-1, lead]
+        case.jumped_alone = case.cause.cause == "element" and bool(abs(error[-1, lead] - jump) < SAME * abs(jump))
     case.kind = "swapped" if case.cause.is_exchange else kind_of(
         values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
         values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
+        case.has_jumped,
     )  # fmt: skip
     case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
 

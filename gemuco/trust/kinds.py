@@ -15,7 +15,7 @@ BETTER = 0.5
 
 def kind_of(
     value: np.ndarray, error: np.ndarray, healthy: float, std: float, unit: str, is_noise: bool,
-    others: np.ndarray | None = None, span: float = np.inf,
+    others: np.ndarray | None = None, span: float = np.inf, has_jumped: bool = False,
 ) -> str:  # fmt: skip
     """Return the kind of a lie; `unknown` of fewer than three blocks that no simple kind fits.
 
@@ -26,8 +26,9 @@ def kind_of(
         std: Standard deviation of the signal [unit].
         unit: Unit of the element.
         is_noise: Whether its noise is the strongest evidence.
-        others: Predictions of other elements that are wrong too [unit of `value`], shape (blocks, others).
+        others: Predictions of other elements of the signal that are wrong too [unit of `value`], shape (blocks, n).
         span: Largest range of the value within a block [standard deviations].
+        has_jumped: Whether it began with a jump; then a constant value of a body at rest is not frozen.
     """
     if is_noise:
         return "noise"
@@ -40,7 +41,7 @@ def kind_of(
         if np.ptp(predicted) > MOVED * healthy:
             outer = np.abs(predicted).min() >= abs(value.mean()) and np.all(predicted * value.mean() > 0)
             return "clipped" if outer else "frozen"
-        if len(value) >= 3:
+        if len(value) >= 3 and not has_jumped:
             return "frozen"
     mean = float(np.median(error))
     turns = mean * std / TURN

@@ -45,8 +45,8 @@ second multiple of an alarm. One of them has at least the third share of the lar
 UNEXPLAINED, ONCE_MORE = 3, 100
 """If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
-"""On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm,
-explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
+"""On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm, is a
+jump or explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
 MOVED = 30.0
 """A body is not known before it has moved for this number of blocks, with this tool: at rest it shows one posture."""
 AT_ONCE, ONCE = 3, 15
@@ -328,14 +328,13 @@ class TrustMonitor:
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
         rest = self._rest(case, self._hidden_columns() | self._recent.missing())
-        is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
-        if rest.level > STRANGE or not (self._is_known_body(case.cause.columns) or is_gross):
+        case.is_gross = ratio >= GROSS and rest.level < LIKE
+        is_sure = case.is_gross and (case.moved >= LONG or case.jumped_alone)
+        if rest.level > STRANGE or not (self._is_known_body(case.cause.columns) or is_sure):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
-        if not self._replaces(self.hidden | elements):
-            return "the model cannot replace it"
-        return ""
+        return "" if self._replaces(self.hidden | elements) else "the model cannot replace it"
 
     def _judge_again(self, case: Case) -> None:
         """Let a hidden cause return if it agrees, and correct it while that is possible."""

@@ -172,6 +172,7 @@ class GemucoService:
             self.service.publisher(keys.update(self.robot.robot), Update).put,
             self.clock,
             self._others_keep_time,
+            lambda: self.trust.doubts,
             self.acquaintance.learned,
             1.0 / self.robot.rates.update,
         )

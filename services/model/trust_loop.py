@@ -192,6 +192,11 @@ class Trust:
         name = self._names[needed[0]]
         return f"{name} is {self._freshness.distrust.reasons.get(name, 'distrusted')}, and motion needs it."
 
+    @property
+    def doubts(self) -> bool:
+        """Whether an element is suspected of a gross lie and still used."""
+        return any(finding.is_gross and not finding.is_distrusted for finding in self.findings)
+
     def text(self) -> str:
         """Return one sentence on what is distrusted or suspected; empty without."""
         parts = [self._sentence(finding) for finding in self.findings]

@@ -33,6 +33,8 @@ COST_MEMORY = 0.2
 APART = 0.25
 """A model with another W but the same p replaces the one in use after at least this time [s]: every replacement costs
 the other loops a search and new statistics, and W moves little in this time."""
+DOUBTED_SINCE = 2.0
+"""A sensor may have lied for this time [s] before it is suspected."""
 NORMAL_AFTER = 200
 """After an update of W normal errors are learned anew as soon as this number of samples came, or the window is full."""
 
@@ -50,8 +52,12 @@ class BodyUpdater(Protocol):
         """Samples of the window, oldest first, shape (n, size)."""
         ...
 
-    def add(self, values: Mapping[str, np.ndarray]) -> Any:
-        """Add one complete sample [unit]."""
+    def add(self, values: Mapping[str, np.ndarray]) -> bool:
+        """Add one complete sample [unit]; return whether it is of use."""
+        ...
+
+    def forget(self, count: int) -> None:
+        """Drop this number of the newest samples."""
         ...
 
     def step(self, most: int) -> Any:
@@ -76,6 +82,7 @@ class OnlineUpdate:
         publish: Callable[[Update], None],
         clock: Clock,
         may_learn: Callable[[], bool] = lambda: True,
+        is_doubted: Callable[[], bool] = lambda: False,
         learned: Callable[[BodySchema], None] = lambda schema: None,
         period: float = 0.1,
     ) -> None:
@@ -90,10 +97,11 @@ class OnlineUpdate:
             publish: Publishes the state.
             clock: Source of time.
             may_learn: Whether learning is allowed in this tick; if not, samples are only collected.
+            is_doubted: Whether a sensor is suspected of a gross lie and still used; no sample is taken then.
             learned: Called with a model whose normal errors were learned from this body.
             period: Time between two ticks [s].
         """
-        self._may_learn, self._learned = may_learn, learned
+        self._may_learn, self._is_doubted, self._learned = may_learn, is_doubted, learned
         self._awaits_normal = False
         self.waited = 0
         """This is the number of ticks in which learning was not allowed."""
@@ -109,6 +117,9 @@ class OnlineUpdate:
         """Times [s] and samples since the model changed."""
         self._known = living.schema.normal
         """What was normal before these samples; what was learned from some of them is no knowledge beside them."""
+        self._added: deque[float] = deque(maxlen=config.window)
+        """Times [s] of the samples that the learner got."""
+        self._was_doubted = False
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = self._swapped_at = -math.inf
@@ -125,6 +136,7 @@ class OnlineUpdate:
             if active and self._learner is None:
                 self._living.keep()
                 self._learner, self._used = self._make_learner(self._living.schema), self._living.schema
+                self._added.clear()
                 # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
@@ -153,10 +165,19 @@ class OnlineUpdate:
             return self._learn_normal()
 
     def forget(self, since: float) -> None:
-        """Learn no normal errors from samples after a time [s]: a sensor lied in them."""
+        """Learn nothing more from samples after a time [s]: a sensor lied in them."""
         with self._lock:
-            while self._since_change and self._since_change[-1][0] >= since:
-                self._since_change.pop()
+            self._forget(since)
+
+    def _forget(self, since: float) -> None:
+        while self._since_change and self._since_change[-1][0] >= since:
+            self._since_change.pop()
+        lying = 0
+        while self._added and self._added[-1] >= since:
+            self._added.pop()
+            lying += 1
+        if self._learner is not None:
+            self._learner.forget(lying)
 
     def _begin(self) -> None:
         """Collect samples anew, because the model changed."""
@@ -182,13 +203,13 @@ class OnlineUpdate:
     def tick(self) -> None:
         """Add the newest sample if the robot moves or is engaged, and learn if active."""
         with self._lock:
-            sample, moved = self._newest()
+            sample, moved = self._believed()
             if sample is not None and _is_complete(sample) and (moved or self._is_engaged()):
                 self._since_change.append((self._clock.monotonic(), sample))
             if self._learner is not None and not self._may_learn():
                 self.waited += 1
                 if moved and sample is not None:
-                    self._learner.add(sample)
+                    self._add(self._learner, sample)
                 count = len(self._learner.samples)
                 self._state = replace(self._state, stamp_ns=self._clock.now_ns(), active=True, window=count)
             elif self._learner is None:
@@ -217,6 +238,19 @@ class OnlineUpdate:
             log.warning("Normal errors were not learned after the update: %s", error)
             self._awaits_normal = False
 
+    def _add(self, learner: BodyUpdater, sample: Values) -> None:
+        if learner.add(sample):
+            self._added.append(self._clock.monotonic())
+
+    def _believed(self) -> tuple[Values | None, bool]:
+        """Return the newest sample, as `_newest`; none while a sensor is suspected of a gross lie."""
+        was_doubted, self._was_doubted = self._was_doubted, self._is_doubted()
+        if not self._was_doubted:
+            return self._newest()
+        if not was_doubted:
+            self._forget(self._clock.monotonic() - DOUBTED_SINCE)
+        return None, False
+
     def _newest(self) -> tuple[Values | None, bool]:
         """Return the newest sample, and whether it is far enough in motion and time from the last to be learned from.
 
@@ -242,7 +276,7 @@ class OnlineUpdate:
 
     def _learn(self, learner: BodyUpdater, sample: Values | None) -> Update:
         if sample is not None:
-            learner.add(sample)
+            self._add(learner, sample)
         started = self._clock.monotonic()
         result = learner.step(max(1, int(BUDGET * self._period / self._cost)))
         if result.steps:

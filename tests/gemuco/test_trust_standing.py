@@ -108,3 +108,31 @@ def test_healthy_errors_are_expected_as_large_as_they_were_also_if_they_are_larg
         assert 0.5 < np.sqrt(np.mean(ratio[stands] ** 2)) < 1.2
         assert 0.3 < np.sqrt(np.mean(ratio[~stands] ** 2)) < 1.2
         assert np.median(size[stands, STEERING]) > 1.5 > np.median(size[~stands, STEERING])
+
+
+def standing(blocks, random):
+    """Return samples of a car that drives steadily from the start, with little noise, shape (blocks, SAMPLES, 4)."""
+    yaw = 8.0 * 0.05 / 2.7
+    true = np.array([8.0 - HALF * yaw, 8.0 + HALF * yaw, yaw, 0.05])
+    return true + 0.01 * np.array([0.03, 0.03, 0.004, 0.003]) * random.normal(size=(blocks, SAMPLES, 4))
+
+
+@pytest.mark.parametrize(("element", "lie"), [(YAW, 0.5), (LEFT, 2.0), (RIGHT, -3.0)])
+def test_a_gross_jump_is_hidden_also_before_the_body_has_moved(model, element, lie):
+    samples = standing(200, np.random.default_rng(element))
+    samples[150:, :, element] += lie
+    monitor, hidden = TrustMonitor(model), []
+    for index, block in enumerate(model.scaler.normalise(samples)):
+        monitor.add(block, index * BLOCK)
+        hidden.append(monitor.hidden)
+    assert not any(hidden[:150])
+    assert hidden[155] == hidden[-1] == {element}
+    assert monitor.findings[0].kind == "offset", "a value that stands still because the body does is not frozen"
+
+
+@pytest.mark.parametrize("other", [0.8, 1.2])
+def test_a_body_that_moves_for_the_first_time_and_is_another_one_hides_none(model, other):
+    samples = standing(200, np.random.default_rng(3))
+    change = 8.0 * 0.3 / 2.7 * other  # another wheel base
+    samples[150:] += np.array([-HALF * change, HALF * change, change, 0.3])
+    assert not any(hidden_in(model, samples))

@@ -23,7 +23,7 @@ class Bench:
     def __init__(self, window: int = 50, interval: float = 0.1, schema: BodySchema | None = None) -> None:
         self.clock = ManualClock()
         self.newest: Arrival[Sample] | None = None
-        self.engaged = False
+        self.engaged = self.doubted = False
         self.report: list[Update] = []
         self.living = LivingModel(schema or small_model())
         self.update = OnlineUpdate(
@@ -34,6 +34,7 @@ class Bench:
             lambda: self.engaged,
             self.report.append,
             self.clock,
+            is_doubted=lambda: self.doubted,
         )
 
     def turn(self, index: int, silent: tuple[str, ...] = ()) -> Update:
@@ -100,6 +101,29 @@ def test_normal_errors_learned_meanwhile_stay_if_the_update_learned_nothing() ->
     learned = bench.living.schema
     bench.update.adapt(False)
     assert bench.living.schema is learned
+
+
+def test_nothing_is_learned_while_a_sensor_is_suspected_of_a_gross_lie() -> None:
+    bench = Bench(window=200)
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 31):
+        bench.turn(index)
+    bench.doubted = True
+    for index in range(31, 60):
+        assert bench.turn(index).window == 11, "nor from the 2 s before"
+    bench.doubted = False
+    assert bench.turn(60).window == 12
+
+
+def test_what_was_learned_while_a_sensor_lied_is_dropped() -> None:
+    bench = Bench(window=200)
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 31):
+        bench.turn(index)
+    bench.update.forget(bench.clock.monotonic() - 0.95)  # ten samples ago
+    assert bench.turn(31).window == 21
 
 
 @pytest.mark.parametrize("why", ["rest", "silent", "stale"])
@@ -208,8 +232,12 @@ class SlowLearner:
         self.schema, self.owed, self.taken = schema, owed, []
         self._clock, self._duration = clock, duration
 
-    def add(self, values: object) -> None:
+    def add(self, values: object) -> bool:
         self.owed += 1
+        return True
+
+    def forget(self, count: int) -> None:
+        """Keep all."""
 
     def step(self, most: int) -> UpdateResult:
         steps = min(most, self.owed)
