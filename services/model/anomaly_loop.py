@@ -82,7 +82,7 @@ class AnomalyWatch:
         self._odd: deque[Numbers] = deque(maxlen=ODD)
         self._recent: deque[tuple[float, Numbers]] = deque(maxlen=WINDOWS[-1])
         self._lasting_since = math.inf
-        self._last_cycle = -1
+        self._last: Numbers | None = None
         self._scored: tuple[BodySchema, Numbers, Deviation, str] | None = None
         self._wanted: np.ndarray | None = None
         self._judged: _Judged | None = None
@@ -92,7 +92,7 @@ class AnomalyWatch:
 
     def tick(self) -> None:
         """Score the newest sample; NaN and no blame without a fresh sample or without normal data."""
-        fresh, values = self._freshness.take()
+        fresh, values = self._freshness.together()
         schema, known = self._schema(), self._scored
         now = self._clock.monotonic()
         if known is not None and known[0].normal is not schema.normal:
@@ -102,17 +102,17 @@ class AnomalyWatch:
             known = self._scored = schema, values, deviation, deviation.largest(schema)
         deviation = known[2]
         cycle = -1 if fresh is None else fresh.message.cycle
-        is_odd = deviation.distance > deviation.threshold
+        is_odd, is_new = deviation.distance > deviation.threshold, values is not self._last
         if is_odd:
             self._above_since = min(self._above_since, now)
-            if cycle != self._last_cycle or not self._odd:
+            if is_new or not self._odd:
                 self._odd.append(values)
         else:
             self._above_since = math.inf
             self._odd.clear()
-        if fresh is not None and cycle != self._last_cycle and math.isfinite(deviation.distance):
+        if fresh is not None and is_new and math.isfinite(deviation.distance):
             self._keep(schema, values, is_odd, now)
-        self._last_cycle = cycle
+        self._last = values
         self._report(schema, deviation, known[3], cycle, now)
 
     def _begin(self) -> None:

@@ -93,7 +93,9 @@ class Freshness:
         self._joined: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
         self.distrust = Distrust(np.zeros(self.elements.size, bool))
         """These elements are not used as measured."""
-        self._trusted: tuple[Numbers, Distrust, Numbers] | None = None
+        self.aligned: Numbers | None = None
+        """The trust loop sets the newest values that were measured at one time, if the robot has a camera."""
+        self._trusted, self._trusted_aligned = _Rest(), _Rest()
 
     def take(self) -> tuple[Arrival[Sample] | None, Numbers]:
         """Return the HAL's newest sample, and all usable values [unit], shapes (n,).
@@ -103,13 +105,19 @@ class Freshness:
         sample comes, a value becomes stale, or the distrust changes. Any thread may call this.
         """
         fresh, values = self.measured()
-        distrust, trusted = self.distrust, self._trusted
-        if distrust.is_empty:
+        return fresh, self._trusted.of(values, self.distrust)
+
+    def together(self) -> tuple[Arrival[Sample] | None, Numbers]:
+        """Return the same as `take`, but of a robot with a camera values that were measured at one time.
+
+        A camera reports later than encoders, so the newest values of a moving robot do not belong together: at 2 rad/s
+        the hand moves by centimetres in this time. They are older than the newest ones by the delay of the camera.
+        """
+        fresh, values = self.take()
+        aligned = self.aligned
+        if fresh is None or aligned is None:
             return fresh, values
-        if trusted is None or trusted[0] is not values or trusted[1] is not distrust:
-            rest = Numbers(_unwritable(np.where(distrust.hidden, np.nan, values.flat)), self.elements)
-            trusted = self._trusted = values, distrust, rest
-        return fresh, trusted[2]
+        return fresh, self._trusted_aligned.of(aligned, self.distrust)
 
     def measured(self) -> tuple[Arrival[Sample] | None, Numbers]:
         """Return the same as `take`, with the values of distrusted elements."""
@@ -139,6 +147,23 @@ class Freshness:
         youngest = float(np.min(age, initial=math.inf, where=np.isfinite(age)))
         values, _ = source.usable(arrival, now)
         return Dated(arrival.received - (youngest if math.isfinite(youngest) else 0.0), values)
+
+
+class _Rest:
+    """Values without the distrusted ones; the same object for the same values and distrust."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Numbers, Distrust, Numbers] | None = None
+
+    def of(self, values: Numbers, distrust: Distrust) -> Numbers:
+        """Return the values, NaN where distrusted."""
+        if distrust.is_empty:
+            return values
+        last = self._last
+        if last is None or last[0] is not values or last[1] is not distrust:
+            rest = Numbers(_unwritable(np.where(distrust.hidden, np.nan, values.flat)), values.elements)
+            last = self._last = values, distrust, rest
+        return last[2]
 
 
 class _Source:

@@ -44,7 +44,7 @@ class Hindsight:
 
     def look(self) -> None:
         """Predict every measured output from the other signals, if the robot moved since the last time."""
-        fresh, values = self._freshness.take()
+        fresh, values = self._freshness.together()
         now, schema = self._clock.monotonic(), self._schema()
         if fresh is None or now - self._looked_at < 0.9 * APART:
             return

@@ -144,7 +144,11 @@ class Trust:
                 self._camera = camera.values
                 self._aligned.see(camera.time, camera.values)
             rows = self._aligned.take(now)
-        return [Numbers(row, self._freshness.elements) for row in rows]
+        taken = [Numbers(row, self._freshness.elements) for row in rows]
+        if camera is not None and taken:
+            taken[-1].flat.setflags(write=False)
+            self._freshness.aligned = taken[-1]
+        return taken
 
     def _far(self, schema: BodySchema) -> np.ndarray:
         """Return whether each element is back far from its estimate, shape (size,); not if it cannot be estimated."""

@@ -257,7 +257,7 @@ class OnlineUpdate:
         An incomplete sample still determines p. A model without p does not use it: W would drift in the signals that
         are not measured, and no data of another condition hold it.
         """
-        fresh, values = self._freshness.take()
+        fresh, values = self._freshness.together()
         if fresh is None:
             return None, False
         row = self._living.schema.normalise(values)
