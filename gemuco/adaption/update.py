@@ -148,13 +148,10 @@ class Updater:
             self._owed = min(self._owed + self._steps_of_a_sample(), float(YOUNG * self.config.steps))
         return True
 
-    def forget(self, count: int) -> None:
-        """Drop this number of the newest samples: a sensor lied in them. W keeps what it learned of them."""
-        if count:
-            self._relearner.window.forget_from(self._relearner.window.added - count)
-            self._pending = self._pending[:-count]
-            for _ in range(min(count, len(self._newest))):
-                self._newest.pop()
+    def forget(self, count: int, schema: BodySchema) -> None:
+        """Drop this number of the newest samples, in which a sensor lied, and go on from the schema before them."""
+        self._relearner.window.forget_from(self._relearner.window.added - count)
+        self._begin(schema)
 
     def _is_usable(self, x: np.ndarray) -> bool:
         whole = self.schema.layout.whole(np.isfinite(x))

@@ -49,7 +49,8 @@ class Healthy:
         self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
         self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
         self._pace = LEAST_PACE
-        self._noise, self._noise_count = np.full(size, 1e-6), np.zeros(size)
+        self._noise, self._noise_count = np.full((2, size), 1e-6), np.zeros((2, size))
+        """This is the noise at rest and in motion: values of a fast motion do not fit each other as well."""
 
     def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float) -> None:
         """Learn from one block; columns whose newest error is NaN keep what they have.
@@ -77,8 +78,9 @@ class Healthy:
         self._excess = self._excess * fade + np.where(above, steps - COMMON, 0.0)
         self._exceeding = self._exceeding * fade + above
         is_noise = np.isfinite(noise)
-        self._noise_count += is_noise
-        share = is_noise / np.clip(self._noise_count, 1.0, MEMORY)
+        weight = is_noise * np.array([[1.0 - motion], [motion]])
+        self._noise_count += weight
+        share = weight / np.clip(self._noise_count, 1.0, MEMORY)
         change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
         self._noise += share * (change - self._noise)
 
@@ -116,8 +118,14 @@ class Healthy:
 
     @property
     def noise(self) -> np.ndarray:
-        """Variance of the noise within a block, in units of the learned errors, shape (n,); infinite if unknown."""
-        return np.where(self._noise_count >= NOISE_KNOWN, self._noise, np.inf)
+        """Variance of the noise within a block, in units of the learned errors, shape (n,); infinite if unknown.
+
+        It is the larger one of that at rest and in motion, and unknown while that of a motion is not known yet.
+        """
+        known = np.where(self._noise_count >= NOISE_KNOWN, self._noise, np.inf)
+        has_moved = self._noise_count[1] >= 1.0
+        at_rest = np.where(np.isfinite(known[0]), known[0], 0.0)
+        return np.where(has_moved, np.maximum(known[1], at_rest), known[0])
 
     @property
     def likeness(self) -> Likeness:

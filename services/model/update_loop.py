@@ -33,6 +33,8 @@ COST_MEMORY = 0.2
 APART = 0.25
 """A model with another W but the same p replaces the one in use after at least this time [s]: every replacement costs
 the other loops a search and new statistics, and W moves little in this time."""
+PAST = 32
+"""This number of models is kept, to go back if a sensor lied: 8 s of them."""
 DOUBTED_SINCE = 2.0
 """A sensor may have lied for this time [s] before it is suspected."""
 NORMAL_AFTER = 200
@@ -56,8 +58,8 @@ class BodyUpdater(Protocol):
         """Add one complete sample [unit]; return whether it is of use."""
         ...
 
-    def forget(self, count: int) -> None:
-        """Drop this number of the newest samples."""
+    def forget(self, count: int, schema: BodySchema) -> None:
+        """Drop this number of the newest samples, and go on from the schema before them."""
         ...
 
     def step(self, most: int) -> Any:
@@ -119,6 +121,8 @@ class OnlineUpdate:
         """What was normal before these samples; what was learned from some of them is no knowledge beside them."""
         self._added: deque[float] = deque(maxlen=config.window)
         """Times [s] of the samples that the learner got."""
+        self._past: deque[tuple[float, BodySchema]] = deque(maxlen=PAST)
+        """Times [s] and models of the newest replacements, the first of which may be the model before the update."""
         self._was_doubted = False
         self._last: np.ndarray | None = None
         self._awaits_first = False
@@ -137,6 +141,7 @@ class OnlineUpdate:
                 self._living.keep()
                 self._learner, self._used = self._make_learner(self._living.schema), self._living.schema
                 self._added.clear()
+                self._past = deque([(-math.inf, self._used)], PAST)
                 # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
@@ -176,8 +181,11 @@ class OnlineUpdate:
         while self._added and self._added[-1] >= since:
             self._added.pop()
             lying += 1
-        if self._learner is not None:
-            self._learner.forget(lying)
+        if self._learner is not None and lying:
+            while len(self._past) > 1 and self._past[-1][0] >= since:
+                self._past.pop()
+            self._learner.forget(lying, self._past[-1][1])
+            self._use(self._learner)
 
     def _begin(self) -> None:
         """Collect samples anew, because the model changed."""
@@ -303,6 +311,7 @@ class OnlineUpdate:
             self._used = learner.schema
             self._living.swap(learner.schema)
             self._swapped_at = self._clock.monotonic()
+            self._past.append((self._swapped_at, learner.schema))
             self._begin()
 
 

@@ -97,6 +97,19 @@ def test_the_usual_noise_of_an_element_is_that_since_it_is_measured():
             assert healthy.noise[1] == pytest.approx(0.9, abs=0.5)
 
 
+def test_what_a_fast_motion_shows_is_no_noise_after_a_rest():
+    healthy, nothing = Healthy(1), (np.zeros((LONGEST, 1)), np.zeros(1))
+    for _ in range(100):
+        healthy.add(*nothing, np.full(1, 1e-3), 0.0)
+    assert healthy.noise[0] == pytest.approx(1e-3, rel=0.1)
+    for block in range(60):
+        healthy.add(*nothing, np.full(1, 0.5), 1.0)
+        assert block >= NOISE_KNOWN - 1 or healthy.noise[0] == np.inf, "that of motion is not known yet"
+    for _ in range(6000):
+        healthy.add(*nothing, np.full(1, 1e-3), 0.0)
+    assert healthy.noise[0] == pytest.approx(0.5, rel=0.1)
+
+
 @pytest.mark.parametrize(("share", "is_noise"), [(0.6, False), (0.8, True)])
 def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     healthy = Healthy(2)

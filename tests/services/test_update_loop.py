@@ -120,9 +120,12 @@ def test_what_was_learned_while_a_sensor_lied_is_dropped() -> None:
     bench = Bench(window=200)
     bench.turn(0)
     bench.update.adapt(True)
+    models = [bench.living.schema]
     for index in range(1, 31):
         bench.turn(index)
+        models.append(bench.living.schema)
     bench.update.forget(bench.clock.monotonic() - 0.95)  # ten samples ago
+    assert bench.living.schema.weights is models[20].weights is not models[30].weights
     assert bench.turn(31).window == 21
 
 
@@ -236,7 +239,7 @@ class SlowLearner:
         self.owed += 1
         return True
 
-    def forget(self, count: int) -> None:
+    def forget(self, count: int, schema: BodySchema) -> None:
         """Keep all."""
 
     def step(self, most: int) -> UpdateResult:

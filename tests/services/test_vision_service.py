@@ -15,6 +15,7 @@ from small_arm import description as arm_description
 from small_arm import eventually
 from small_hand import HandWorld, config
 
+from gemuco import TrainConfig, fit
 from hal.clock import ManualClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError
@@ -22,7 +23,8 @@ from services.client import Client
 from services.errors import AlreadyRunning, RemoteError
 from services.hardware.vision_service import run_vision
 from services.learning.collector import Request, collect_direct
-from services.model.estimation import Freshness
+from services.model.estimation import Distrust, Freshness
+from services.model.trust_loop import Trust
 from services.process.service import Service
 from services.recording.reading import read
 from services.recording.recorder import Recorder
@@ -254,6 +256,36 @@ def test_each_signal_is_fresh_for_as_long_as_its_own_stale_after() -> None:
     fresh, values = bench.freshness.take()
     assert fresh is bench.hal
     assert np.isnan(values["tool_tip_position"]).all(), "older than 0.2 s"
+
+
+def test_values_of_one_time_are_judged_and_learned_also_if_the_camera_is_late() -> None:
+    bench, units = Bench(), {"joint_position": "rad", "center_of_gravity": "m", "tool_tip_position": "m"}
+    sizes = {"joint_position": 2, "center_of_gravity": 2, "tool_tip_position": 2}
+    random = np.random.default_rng(0)
+    rows = {name: random.normal(size=(60, size)) for name, size in sizes.items()}
+    schema, _ = fit([rows], TrainConfig(hidden=(8,), epochs=1), [("joint_position",)], units=units)
+    trust = Trust(config(), bench.freshness, lambda: schema, None, bench.clock)
+    for step in range(40):  # the body moves: every value is the time of its measurement, and a frame is 60 ms late
+        bench.clock.advance(0.01)
+        now = bench.clock.monotonic()
+        body = {"joint_position": np.full(2, now), "center_of_gravity": np.full(2, now)}
+        bench.hal = bench.now(body)
+        if step % 5 == 4:
+            bench.seen = bench.now({"tool_tip_position": np.full(2, now - 0.06)}, age=0.06)
+        trust.tick()
+        if step < 15:
+            continue
+        fresh, values = bench.freshness.together()
+        assert fresh is bench.hal
+        np.testing.assert_allclose(values.flat, values["tool_tip_position"][0], atol=1e-6)
+        assert bench.freshness.take()[1]["joint_position"][0] == now, "an estimate is of the newest values"
+        assert now - values["joint_position"][0] < 0.12
+    bench.freshness.distrust = Distrust(np.arange(6) == 1, {})
+    hidden = bench.freshness.together()[1]
+    assert np.isnan(hidden.flat).tolist() == (np.arange(6) == 1).tolist()
+    assert bench.freshness.together()[1] is hidden, "one object for the same values"
+    bench.clock.advance(1.0)
+    assert bench.freshness.together()[0] is None
 
 
 def test_a_signal_is_taken_from_its_own_source_and_no_other() -> None:
