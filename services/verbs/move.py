@@ -81,6 +81,7 @@ def _check_limits(hal: Mapping[str, Any], signal: str, goal: np.ndarray) -> None
 
 def _stream(client: Client, hal: Mapping[str, Any], signal: str, goal: np.ndarray) -> None:
     """Enable the drives and command a smooth move from the present position."""
+    _wait_for_stop(client)
     client.enable()
     if (mode := wait_for_mode(client, (*LIVE, "fault"))) not in LIVE:
         raise ServiceError(f"The drives were not enabled: the mode is '{mode}'. {fault_text(client)}".strip())
@@ -94,6 +95,15 @@ def _stream(client: Client, hal: Mapping[str, Any], signal: str, goal: np.ndarra
         client.command(signal, points[min(index, len(points) - 1)], sample)
         sample = _next(client)
         _check_mode(client)
+
+
+def _wait_for_stop(client: Client) -> None:
+    """Wait until the drives are off, for 5 s at most.
+
+    After the move before, or after `enable`, they hold for a time without commands, and then stop.
+    This would end the move that has just begun.
+    """
+    wait_for_mode(client, ("off", "fault"))
 
 
 def _next(client: Client) -> Sample:
@@ -112,6 +122,7 @@ def _check_mode(client: Client) -> None:
 
 def _control(client: Client, signal: str, goal: np.ndarray) -> None:
     """Let the model's controller move, and wait until the signal has come to rest."""
+    _wait_for_stop(client)
     client.engage()
     if (mode := wait_for_mode(client, (*LIVE, "fault"))) not in LIVE:
         raise ServiceError(f"The drives were not enabled: the mode is '{mode}'. {fault_text(client)}".strip())

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,6 +46,15 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def ask(robot: str, *words: str) -> subprocess.CompletedProcess[str]:
     command = gemuco_command("query", robot, *words)
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+
+
+@pytest.mark.slow
+def test_moves_follow_each_other_at_any_time(robot: str) -> None:
+    """The drives hold for 0.5 s after a move and then stop; the next one may begin at any moment of this."""
+    for index in range(6):
+        moved = ask(robot, "move", "joint_position", str(0.1 * (-1) ** index))
+        assert moved.returncode == 0, moved.stderr
+        time.sleep(0.15 * index)
 
 
 @pytest.mark.slow
