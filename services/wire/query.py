@@ -20,7 +20,6 @@ import zenoh
 from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.errors import NoAnswer, RemoteError, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
-from services.runtime import services_here
 from services.wire import keys
 from services.wire.caller import CURRENT_CALLER, LONGEST_NAME, UNKNOWN, Caller
 from services.wire.messages import MAX_BYTES, UNREADABLE, VERSION, MessageError
@@ -290,6 +289,8 @@ def describe_presence(session: zenoh.Session, robot: str) -> str:
 
 def _here(robot: str) -> str:
     """Return the other robots of this machine, whose name may have been meant: a sentence, or empty."""
+    from services.runtime import services_here  # a client loads nothing of the HAL before it needs this
+
     try:
         others = sorted({name for name, _ in services_here() if name != robot})
     except ServiceError:  # no folder of locks, which a client does not need
