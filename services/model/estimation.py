@@ -22,6 +22,8 @@ from services.model.ways import Ways
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
 
+ALIGNED_FOR = 1.0
+"""Values that were measured at one time are used for this time [s]; then the newest ones are, which may not be."""
 WRONG = 3.0
 """An estimate is doubtful if the errors of its element were this many times as large as learned, while it was seen."""
 
@@ -93,8 +95,8 @@ class Freshness:
         self._joined: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
         self.distrust = Distrust(np.zeros(self.elements.size, bool))
         """These elements are not used as measured."""
-        self.aligned: Numbers | None = None
-        """The trust loop sets the newest values that were measured at one time, if the robot has a camera."""
+        self._aligned: tuple[float, Numbers] | None = None
+        """Time at which they were set [s], and the newest values that were measured at one time."""
         self._trusted, self._trusted_aligned = _Rest(), _Rest()
 
     def take(self) -> tuple[Arrival[Sample] | None, Numbers]:
@@ -114,10 +116,15 @@ class Freshness:
         the hand moves by centimetres in this time. They are older than the newest ones by the delay of the camera.
         """
         fresh, values = self.take()
-        aligned = self.aligned
-        if fresh is None or aligned is None:
+        aligned = self._aligned
+        if fresh is None or aligned is None or self._clock.monotonic() - aligned[0] > ALIGNED_FOR:
             return fresh, values
-        return fresh, self._trusted_aligned.of(aligned, self.distrust)
+        return fresh, self._trusted_aligned.of(aligned[1], self.distrust)
+
+    def align(self, values: Numbers) -> None:
+        """Take the newest values that were measured at one time, of a robot with a camera."""
+        _unwritable(values.flat)
+        self._aligned = self._clock.monotonic(), values
 
     def measured(self) -> tuple[Arrival[Sample] | None, Numbers]:
         """Return the same as `take`, with the values of distrusted elements."""

@@ -146,8 +146,7 @@ class Trust:
             rows = self._aligned.take(now)
         taken = [Numbers(row, self._freshness.elements) for row in rows]
         if camera is not None and taken:
-            taken[-1].flat.setflags(write=False)
-            self._freshness.aligned = taken[-1]
+            self._freshness.align(taken[-1])
         return taken
 
     def _far(self, schema: BodySchema) -> np.ndarray:

@@ -284,8 +284,10 @@ def test_values_of_one_time_are_judged_and_learned_also_if_the_camera_is_late() 
     hidden = bench.freshness.together()[1]
     assert np.isnan(hidden.flat).tolist() == (np.arange(6) == 1).tolist()
     assert bench.freshness.together()[1] is hidden, "one object for the same values"
-    bench.clock.advance(1.0)
+    bench.clock.advance(1.1)
     assert bench.freshness.together()[0] is None
+    bench.hal = bench.now(bench.body)
+    assert bench.freshness.together()[1] is bench.freshness.take()[1], "nothing was aligned for a second"
 
 
 def test_a_signal_is_taken_from_its_own_source_and_no_other() -> None:
