@@ -98,12 +98,12 @@ def _stream(client: Client, hal: Mapping[str, Any], signal: str, goal: np.ndarra
 
 
 def _wait_for_stop(client: Client) -> None:
-    """Wait until the drives are off, for 5 s at most.
+    """Wait until the drives are off, for 5 s at most, unless a controller moves them.
 
     After the move before, or after `enable`, they hold for a time without commands, and then stop.
     This would end the move that has just begun.
     """
-    wait_for_mode(client, ("off", "fault"))
+    wait_for_mode(client, ("off", "follow", "fault"))
 
 
 def _next(client: Client) -> Sample:
