@@ -123,7 +123,7 @@ class OnlineUpdate:
         """Times [s] of the samples that the learner got."""
         self._past: deque[tuple[float, BodySchema]] = deque(maxlen=PAST)
         """Times [s] and models of the newest replacements, the first of which may be the model before the update."""
-        self._was_doubted = False
+        self._was_doubted, self._lied_since = False, math.inf
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = self._swapped_at = -math.inf
@@ -170,13 +170,18 @@ class OnlineUpdate:
             return self._learn_normal()
 
     def forget(self, since: float) -> None:
-        """Learn nothing more from samples after a time [s]: a sensor lied in them."""
+        """Learn nothing more from samples after a time [s]: a sensor lied in them. The next tick goes back."""
         with self._lock:
             self._forget(since)
 
     def _forget(self, since: float) -> None:
         while self._since_change and self._since_change[-1][0] >= since:
             self._since_change.pop()
+        self._lied_since = min(self._lied_since, since)
+
+    def _go_back(self) -> None:
+        """Let the learner drop the samples in which a sensor lied, and go on from the model before them."""
+        since, self._lied_since = self._lied_since, math.inf
         lying = 0
         while self._added and self._added[-1] >= since:
             self._added.pop()
@@ -212,6 +217,7 @@ class OnlineUpdate:
         """Add the newest sample if the robot moves or is engaged, and learn if active."""
         with self._lock:
             sample, moved = self._believed()
+            self._go_back()
             if sample is not None and _is_complete(sample) and (moved or self._is_engaged()):
                 self._since_change.append((self._clock.monotonic(), sample))
             if self._learner is not None and not self._may_learn():

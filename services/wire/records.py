@@ -255,7 +255,7 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
     """The deviation of the body from normal.
 
     Attributes:
-        cycle: `Sample.cycle` of its sample.
+        cycle: `Sample.cycle` of the newest sample; beside a camera the judged values are as old as its frame.
         score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
         threshold: Score above which it counts as an anomaly.
         is_anomaly: Whether the score was above the threshold for as long as the robot file requires, and the cause is

@@ -110,6 +110,10 @@ def test_healthy_errors_are_expected_as_large_as_they_were_also_if_they_are_larg
         assert np.median(size[stands, STEERING]) > 1.5 > np.median(size[~stands, STEERING])
 
 
+SHAKE = 0.04
+"""Misfit of the yaw rate in motion [rad/s]."""
+
+
 def standing(blocks, random):
     """Return samples of a car that drives steadily from the start, with little noise, shape (blocks, SAMPLES, 4)."""
     yaw = 8.0 * 0.05 / 2.7
@@ -128,6 +132,15 @@ def test_a_gross_jump_is_hidden_also_before_the_body_has_moved(model, element, l
     assert not any(hidden[:150])
     assert hidden[155] == hidden[-1] == {element}
     assert monitor.findings[0].kind == "offset", "a value that stands still because the body does is not frozen"
+
+
+@pytest.mark.parametrize("begin", [150, 155])
+def test_the_first_motion_after_a_rest_is_no_burst_of_noise(model, begin):
+    """Values of a fast motion do not fit each other as well within a block as those of a body at rest."""
+    samples = samples_of(model, 260, 31)[60:]
+    samples[:, :, YAW] += SHAKE * np.array([1.0, -1.0, 0.0, -1.0, 1.0])
+    samples[:begin] = standing(begin, np.random.default_rng(5))
+    assert not any(hidden_in(model, samples))
 
 
 @pytest.mark.parametrize("other", [0.8, 1.2])

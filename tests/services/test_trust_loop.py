@@ -170,6 +170,23 @@ def test_elements_that_were_all_late_are_used_at_once() -> None:
         assert not any(marks.any() for marks in estimates.estimated.values())
 
 
+def test_a_gross_lie_that_is_still_used_is_a_doubt_and_a_hidden_one_is_none() -> None:
+    bench, samples = Bench(is_known=False), motion(900, 3)
+    place = arm().signals["joint_position"].elements.index("elbow_pitch")
+    for sample in samples[:300]:
+        bench.feed(sample)
+        assert not bench.trust.doubts
+    doubts = 0
+    for index, sample in enumerate(samples[300:]):
+        lie = 0.5 * min(1.0, index / 50) * np.eye(5)[place]  # rad; no jump
+        estimates = bench.feed(sample | {"joint_position": sample["joint_position"] + lie})
+        doubts += bench.trust.doubts
+        assert not (bench.trust.doubts and estimates.estimated["joint_position"][place])
+    assert doubts > 50
+    assert estimates.estimated["joint_position"][place], "it explained five seconds of motion"
+    assert not bench.trust.doubts
+
+
 def test_an_operator_distrusts_and_trusts() -> None:
     bench, samples = Bench(), motion(60, 2)
     bench.feed(samples[0])

@@ -125,6 +125,8 @@ def test_what_was_learned_while_a_sensor_lied_is_dropped() -> None:
         bench.turn(index)
         models.append(bench.living.schema)
     bench.update.forget(bench.clock.monotonic() - 0.95)  # ten samples ago
+    assert bench.living.schema is models[30], "other loops do not wait for it"
+    bench.turn(30)  # nothing new
     assert bench.living.schema.weights is models[20].weights is not models[30].weights
     assert bench.turn(31).window == 21
 
