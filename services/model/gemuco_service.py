@@ -16,7 +16,7 @@ from gemuco.intervals.region import Region
 from gemuco.intervals.sureness import Sureness
 from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
-from hal.clock import SystemClock
+from hal.clock import Clock, SystemClock
 from hal.config import RobotConfig
 from hal.errors import HalError
 from services.command.intake import NEWS_FOR, Intake
@@ -119,10 +119,10 @@ class ModelSolver:
 class GemucoService:
     """The four loops of one robot, bound to its session."""
 
-    def __init__(self, robot: RobotConfig, schema: BodySchema, service: Service) -> None:
+    def __init__(self, robot: RobotConfig, schema: BodySchema, service: Service, clock: Clock | None = None) -> None:
         """Subscribe, publish and prepare; the loops do not run yet."""
         self.robot, self.config, self.service = robot, model_config(robot), service
-        self.clock = SystemClock()
+        self.clock = clock or SystemClock()
         self.living = LivingModel(schema)
         self._samples = service.newest(keys.sample(robot.robot), Sample)
         self._seen = service.newest(keys.vision(robot.robot), Sample) if robot.seen else None

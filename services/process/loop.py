@@ -92,10 +92,10 @@ class Loop:
         """This is `fifo` when real-time scheduling was granted."""
         self.failed = 0
         """This is the number of ticks that raised."""
-        self._tick = tick
+        self.tick = tick
         self._clock = clock or SystemClock()
         self._priority = priority
-        self._offset = offset
+        self.offset = offset
         self._waited = waited
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -185,7 +185,7 @@ class Loop:
         self.scheduling = prepare_thread(self._priority)
         clock = self._clock
         now = clock.monotonic()
-        self._grid = Grid.aligned(1.0 / self.rate, self._offset, now)
+        self._grid = Grid.aligned(1.0 / self.rate, self.offset, now)
         self._counted = (now, 0, 0.0)
         while not self._stop.is_set():
             deadline = self._grid.next(now)
@@ -205,7 +205,7 @@ class Loop:
 
     def _try_tick(self) -> None:
         try:
-            self._tick()
+            self.tick()
         except Exception as error:
             self.failed += 1
             self._error = f"{type(error).__name__}: {error}"
