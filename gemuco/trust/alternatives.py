@@ -46,9 +46,9 @@ class Alternatives:
     def _now(self) -> View:
         return self._recent.view(self._relations, self._hidden)
 
-    def condition(self, name: str, age: int) -> Evidence:
-        """Return the evidence if a trained condition holds since about `age` blocks."""
-        return self._since(self._recent.under(self._schema.under(name), self._relations), age)
+    def under(self, schema: BodySchema, age: int) -> Evidence:
+        """Return the evidence if the p of a schema holds since about `age` blocks."""
+        return self._since(self._recent.under(schema, self._relations), age)
 
     def exchanges(self, evidence: Evidence) -> Iterator[tuple[Hidden, Evidence]]:
         """Yield pairs of elements of one signal with much evidence, and the evidence if they are exchanged back."""

@@ -48,6 +48,16 @@ class Evidence:
     is_slow: np.ndarray
     level: float
 
+    @property
+    def highest(self) -> float:
+        """Largest evidence against any column."""
+        return float(self.ratio.max(initial=0.0))
+
+    @property
+    def newest(self) -> int:
+        """Age of the most likely change of the column with the most evidence [blocks]."""
+        return int(self.age.flat[self.strength.argmax()])
+
 
 class Judge:
     """Limits and tests for the body as it is."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from gemuco.trust.config import Hidden
 from gemuco.trust.evidence import Evidence
+from gemuco.trust.jumps import TOGETHER
 
 TOOL, EXPLAINED = 0.85, 0.6
 """Without the wrong columns the evidence against all others is below the second share of an alarm; a contact of the
@@ -61,6 +62,7 @@ def explain(
     beyond: Hidden = frozenset(),
     sudden: Hidden = frozenset(),
     begun: Hidden = frozenset(),
+    jumped: Hidden = frozenset(),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -76,13 +78,18 @@ def explain(
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
-        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
+        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that
+            are stuck, or that moved while all others rested.
         begun: Columns of parts of which another sensor is hidden already.
+        jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
+            not begun to lie.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
     singles = [int(c) for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and int(c) not in environment]
     singles += sorted(sudden - environment - set(singles))
+    if jumped:
+        singles = [column for column in singles if column in jumped | sudden] if len(jumped) <= TOGETHER else []
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -97,7 +104,7 @@ def explain(
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""
         for column in order[:SEARCHED].tolist():
-            if column not in environment:
+            if column not in environment and not jumped:
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
@@ -108,7 +115,7 @@ def explain(
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)
-    if pair:
+    if pair and (not jumped or pair <= jumped):
         return Cause(pair, "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if environment and not evidence.is_slow[lead]:  # another tool is there at once
         tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden)

@@ -1,22 +1,20 @@
 """The monitor: it judges every element block by block, and hides those that lie until they have agreed again."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
-from gemuco.trust.alternatives import Alternatives, is_another
+from gemuco.trust.bench import LATELY, Bench
 from gemuco.trust.cases import Case, LastSearch, describe, has_moved
-from gemuco.trust.changes import LONGEST, LastingTest
+from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
-from gemuco.trust.evidence import Evidence, Judge
-from gemuco.trust.healthy import Healthy
-from gemuco.trust.hypotheses import SEARCHED, Cause, explain, remaining
-from gemuco.trust.jumps import EARLIER
-from gemuco.trust.recent import Recent, View
+from gemuco.trust.evidence import Evidence
+from gemuco.trust.hypotheses import RIVALS, SEARCHED, Cause, explain, remaining
 from gemuco.trust.relations import Relations
+from gemuco.trust.tool import JudgedTool
 
 CONFIRMED = 2
 """The same cause must explain this number of successive blocks before it is hidden."""
@@ -47,13 +45,17 @@ UNEXPLAINED, ONCE_MORE = 3, 100
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
 """On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm, is a
 jump or explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
+FITS = 0.1
+"""Errors below this share of those with the lie count as no more than healthy ones."""
+BETTER = 0.5
+"""Where no sensor explains the evidence, a p that leaves less than this share of it is judged by."""
 MOVED = 30.0
 """A body is not known before it has moved for this number of blocks, with this tool: at rest it shows one posture."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
-LATELY, SUSPECT = 10, 0.6
-"""Of an element that jumped within the first number of blocks, the second share of an alarm is one: with limits for one
-wrong verdict a week, so much less evidence is enough if a jump of a right element comes once in 20 minutes at most."""
+SUSPECT = 0.6
+"""Of an element that jumped lately, this share of an alarm is one: with limits for one wrong verdict a week, so much
+less evidence is enough if a jump of a right element comes once in 20 minutes at most."""
 PATIENCE = 100
 """An element that jumped away returns after this number of blocks, or after it has jumped back."""
 Replaces = Callable[[frozenset[int]], bool]
@@ -84,42 +86,37 @@ class TrustMonitor:
         self._config, self._devices, self._replaces = config or TrustConfig(), list(devices), replaces
         self.is_known = True
         """Whether the model's normal errors are known to be those of this body."""
-        self._recent, self._count, self._now = Recent(), 0, 0.0
+        self._count, self._now = 0, 0.0
         self._by_hand: dict[int, float] = {}
         self._immune: set[int] = set()
         self._cases: list[Case] = []
-        self._relations: Relations | None = None
-        self._schema: BodySchema | None = None
-        self._healthy, self._met, self._met_at = Healthy(0), schema.bias, 0.0
-        self.use(schema)
+        self._begin(schema)
 
     def use(self, schema: BodySchema) -> None:
         """Judge by another model; what is known of the body is kept unless the normal errors were learned anew."""
-        before, self._schema = self._schema, schema
-        if before is not None and before.normal is schema.normal:
-            if is_another(schema, schema.bias, self._met[None])[0]:
-                self._met, self._met_at = schema.bias, self._healthy.moved
+        if self._tool.schema.normal is schema.normal:
+            self._tool.propose(schema)
+        else:
+            self._begin(schema)
+
+    def _begin(self, schema: BodySchema) -> None:
+        relations, self._tool = Relations.of(schema), JudgedTool(schema)
+        self._known = bench = None if relations is None else Bench(self._tool, relations, self._config)
+        if relations is None or bench is None:
             return
-        self._met, self._met_at = schema.bias, 0.0
-        self._relations = Relations.of(schema)
-        self._view: View | None = None
-        if self._relations is None:
-            return
-        assert schema.normal is not None
-        self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
-        size = len(self._relations.columns)
-        self._recent.clear()
         self._other = self._motion = self._alarmed = 0.0
         self._search, self._missing = LastSearch(), Hidden()
-        self._healthy, self._lasting = Healthy(size), LastingTest(size)
-        self._least = self._relations.sizes(schema, self._config)
-        self._judge = self._fresh_judge()
-        place = {int(position): column for column, position in enumerate(self._relations.columns)}
-        self._place = place
-        self._environment = frozenset(range(self._relations.count, size))
-        movable = [int(p) for p in self._relations.columns[: self._relations.count]]
+        self._jumped: Hidden | None = None
+        """The columns that jumped when the alarm that lasts began, and since, if any did; None without an alarm."""
+        place, movable = bench.place, [int(p) for p in relations.columns[: relations.count]]
         self._parts = [frozenset(place[p] for p in part) for part in parts(schema, movable)]
         self._joined = [frozenset(place[p] for p in device if p in place) for device in self._devices]
+
+    @property
+    def _bench(self) -> Bench:
+        """Blocks, limits and tests of a model whose normal errors are known; without them there are no cases either."""
+        assert self._known is not None
+        return self._known
 
     @property
     def hidden(self) -> frozenset[int]:
@@ -129,15 +126,15 @@ class TrustMonitor:
     @property
     def is_ready(self) -> bool:
         """Whether lies can be noticed: what is normal is known, and enough blocks were seen."""
-        return self._relations is not None and self._healthy.is_known
+        return self._known is not None and self._known.healthy.is_known
 
     def _is_known_body(self, columns: Hidden = frozenset()) -> bool:
         """Whether what is healthy is known of this body, with this tool, in motion; of some columns, or of all."""
-        assert self._schema is not None
+        bench = self._bench
         if any(case.is_hidden and case.changes(columns, self._parts) for case in self._cases):
             return False
-        has_moved = self._healthy.moved - self._met_at >= MOVED
-        return self.is_known and has_moved and not is_another(self._schema, self._schema.bias, self._biases).all()
+        has_moved = bench.tool.seen_for(bench.healthy.moved) >= MOVED
+        return self.is_known and has_moved and bench.is_known_tool
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -169,55 +166,56 @@ class TrustMonitor:
                 (n, size); NaN where not measured.
             now: Time of the last sample [s].
         """
-        if self._relations is None or self._schema is None or not len(samples):
+        if self._known is None or not len(samples):
             return
+        bench = self._known
         self._count, self._now = self._count + 1, now
-        self._recent.add(self._schema, self._relations, samples)
-        motion = self._motion = self._healthy.motion(self._recent.moved())
-        self._recent.rest(motion, self._healthy.looks)
-        is_steady, self._missing = self._missing == self._recent.missing(), self._recent.missing()
+        bench.recent.add(bench.schema, bench.relations, samples)
+        motion = self._motion = bench.healthy.motion(bench.recent.moved())
+        bench.recent.rest(motion, bench.healthy.looks)
+        is_steady, self._missing = self._missing == bench.recent.missing(), bench.recent.missing()
         hidden = self._hidden_columns() | self._missing
-        before = self._view
-        if before is not None and before.hidden - hidden:
-            self._recent.unsettle()  # one that returns may have lied when the body settled
-        view = self._view = self._recent.view(self._relations, hidden)
-        if before is None or before.hidden != hidden:
-            self._lasting = LastingTest(len(self._relations.columns))
-            view = self._view = self._compared(view, before)
         if self._count % REFRESH == 0:
-            self._judge = self._fresh_judge()
-        self._recent.find_repeats(view, self._judge.scale, motion)
-        looks = 0.0 if self._recent.resting else motion  # at rest sensor noise is no motion
-        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
-        evidence = self._judge(view, self._lasting)
-        if self._healthy.is_known:
+            bench.refresh()
+        began = max((case.began for case in self._cases if case.is_hidden), default=self._count)
+        evidence = bench.look(hidden, motion, self._count - began + 1)
+        if bench.healthy.is_known:
             self._decide(evidence, hidden, is_steady)
         is_other = any(case.cause.cause == "body" for case in self._cases)
         self._other = self._other + motion if is_other else 0.0
-        is_quiet = float(evidence.ratio.max(initial=0.0)) < LEARNING
-        if not self._healthy.is_known or is_quiet or self._other > OTHER:
-            self._learn(view, evidence, motion)
+        is_quiet = evidence.highest < LEARNING
+        if not bench.healthy.is_known or is_quiet or self._other > OTHER:
+            bench.learn(evidence, motion)
+        if bench.tool.proposed is not None and self._believes_tool(evidence, hidden):
+            self._jumped = None if bench.tool.is_another else self._jumped
+            bench.tool.accept(bench.healthy.moved)
 
-    def _compared(self, view: View, before: View | None) -> View:
-        """Return a view with newly hidden columns, in which errors are usual that were there before they lied."""
-        if before is None or not before.hidden < view.hidden:
-            known = self._recent.usual
-            self._recent.usual = {columns: usual for columns, usual in known.items() if columns <= view.hidden}
-            return view
-        began = max((case.began for case in self._cases if case.is_hidden), default=self._count)
-        usual = view.usual(self._judge.scale, self._count - began + 1 + EARLIER)
-        self._recent.usual[view.hidden] = usual * self._recent.usual.get(view.hidden, 1.0)
-        return view.scaled(usual)
+    def _believes_tool(self, evidence: Evidence, hidden: Hidden) -> bool:
+        """Whether to judge by the model's own p: nothing contradicts the one so far, or it explains what does."""
+        bench = self._bench
+        highest, causes = evidence.highest, {case.cause.cause for case in self._cases}
+        is_calm = highest < CALM and "environment" not in causes
+        if not bench.healthy.is_known or (is_calm and not bench.tool.is_another):
+            return True
+        least = highest + RIVALS if is_calm else BETTER * highest if "body" in causes else CALM
+        return bench.under_proposed(hidden, evidence) < least
 
     def _decide(self, evidence: Evidence, hidden: Hidden, is_steady: bool) -> None:
         """Suspect, hide and show elements; `is_steady` says whether the same were missing in the block before."""
-        immune = [self._place[p] for p in self._immune if p in self._place]
+        bench = self._bench
+        immune = [bench.place[p] for p in self._immune if p in bench.place]
         ratio = self._left(evidence, hidden)
-        ratio[list(self._sudden(LATELY))] /= SUSPECT
-        stuck = list(self._recent.repeats.stuck - hidden)
+        ratio[list(bench.sudden(LATELY))] /= SUSPECT
+        stuck = list(bench.recent.repeats.stuck - hidden)
         ratio[stuck] = np.maximum(ratio[stuck], 1.0)
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
+        if highest < CALM and not any(case.cause.cause == "environment" for case in self._cases):
+            self._jumped = None
+        elif highest >= 1.0 and self._jumped is None:
+            self._jumped = bench.jumped(evidence.newest) - hidden
+        elif self._jumped:
+            self._jumped |= bench.jumped(1) - hidden  # another lie may begin
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
         is_due = self._count % AGAIN == 0
         again = highest >= 1.0 and self._count % (AGAIN if self._is_known_body() else RARELY) == 0
@@ -227,7 +225,7 @@ class TrustMonitor:
         elif is_alarm or (highest >= DOUBTFUL and is_due and self._hides_others(ratio, hidden)):
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
-            highest = float(evidence.ratio.max(initial=0.0))
+            highest = evidence.highest
             for case in [c for c in self._cases if not c.is_hidden and self._has_lapsed(c, highest)]:
                 self._close(case)
         if is_due:
@@ -235,14 +233,6 @@ class TrustMonitor:
                 self._judge_again(case)
         if immune and is_due and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
-
-    def _conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:
-        """Yield each other trained condition, the evidence if it holds since about `age` blocks, and if it is known."""
-        schema, alternatives = self._schema, self._alternatives(hidden)
-        assert schema is not None
-        for name, bias in schema.biases.items():
-            if not np.array_equal(bias, schema.bias):
-                yield name, alternatives.condition(name, age), not is_another(schema, bias, self._biases).all()
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -259,16 +249,14 @@ class TrustMonitor:
 
     def _rest(self, case: Case, hidden: Hidden) -> Evidence:
         """Return the evidence without the elements of a case, or with exchanged ones in each other's place."""
+        bench = self._bench
         if case.cause.is_exchange:
-            return self._alternatives(hidden).exchanged(case.cause.columns, self._count - case.began + 1)
-        return self._without(hidden, self._count - case.began + 1)(case.cause.columns)
-
-    def _alternatives(self, hidden: Hidden) -> Alternatives:
-        assert self._schema is not None and self._relations is not None
-        return Alternatives(self._schema, self._relations, self._recent, self._judge, hidden)
+            return bench.alternatives(hidden).exchanged(case.cause.columns, self._count - case.began + 1)
+        return bench.without(hidden, self._count - case.began + 1)(case.cause.columns)
 
     def _suspect(self, cause: Cause, evidence: Evidence, hidden: Hidden) -> None:
         """Suspect a cause, or hide it if it has been suspected before."""
+        bench = self._bench
         known = next((case for case in self._cases if not case.is_hidden and case.cause.cause == cause.cause), None)
         if known is not None and known.cause.columns == cause.columns:
             known.seen, known.last = known.seen + 1, self._count
@@ -278,13 +266,13 @@ class TrustMonitor:
             began = self._count - int(evidence.age[cause.lead]) + 1
             known = Case(cause, began, self._count, self._count)
             self._cases.append(known)
-        known.weigh(evidence, self._sudden(LATELY), self._recent.repeats.stuck, self._parts)
-        is_enough = known.is_plain or known.weight >= self._healthy.caution or cause.cause == "environment"
+        known.weigh(evidence, bench.sudden(LATELY), bench.recent.repeats.stuck, self._parts)
+        is_enough = known.is_plain or known.weight >= bench.healthy.caution or cause.cause == "environment"
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
             self._release_recent()
         if known.seen >= CONFIRMED and is_enough and cause.cause != "body":
-            known.reason = self._refusal(known, float(evidence.ratio.max()))
+            known.reason = self._refusal(known, evidence)
             known.is_hidden = not known.reason
             self._limit_at_once(known)
 
@@ -304,9 +292,10 @@ class TrustMonitor:
 
     def _hides_others(self, ratio: np.ndarray, hidden: Hidden) -> bool:
         """Whether one of the columns with the most evidence hides another one that is wrong too."""
-        without, least = self._without(hidden), AMONG * float(ratio.max())
+        bench = self._bench
+        without, least = bench.without(hidden), AMONG * float(ratio.max())
         order = [int(column) for column in np.argsort(-ratio)[:SEARCHED] if ratio[column] >= least]
-        alone = (float(without(frozenset({column})).ratio.max()) for column in order)
+        alone = (without(frozenset({column})).highest for column in order)
         return any(highest >= PLAIN for highest in alone)
 
     def _limit_at_once(self, new: Case) -> None:
@@ -320,17 +309,19 @@ class TrustMonitor:
         self._cases.append(Case(body, min(case.began for case in together), self._count, self._count))
         self._immune.update(elements)
 
-    def _refusal(self, case: Case, ratio: float) -> str:
-        """Return why a cause is not hidden; empty if it is. `ratio` is the evidence, as a multiple of an alarm."""
+    def _refusal(self, case: Case, evidence: Evidence) -> str:
+        """Return why a cause is not hidden; empty if it is."""
+        bench = self._bench
         if case.cause.cause == "environment":
             return ""
         if case.cause.cause == "either" and self._config.pairs == "use":
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
-        rest = self._rest(case, self._hidden_columns() | self._recent.missing())
-        case.is_gross = ratio >= GROSS and rest.level < LIKE
+        rest = self._rest(case, self._hidden_columns() | bench.recent.missing())
+        left = min(rest.level, rest.level / (FITS * evidence.level)) if evidence.level else rest.level
+        case.is_gross = evidence.highest >= GROSS and left < LIKE
         is_sure = case.is_gross and (case.moved >= LONG or case.jumped_alone)
-        if rest.level > STRANGE or not (self._is_known_body(case.cause.columns) or is_sure):
+        if left > STRANGE or not (self._is_known_body(case.cause.columns) or is_sure):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
@@ -338,32 +329,35 @@ class TrustMonitor:
 
     def _judge_again(self, case: Case) -> None:
         """Let a hidden cause return if it agrees, and correct it while that is possible."""
-        assert self._relations is not None and self._schema is not None
-        rest = (self._hidden_columns() - case.cause.columns) | self._recent.missing()
-        shown = self._recent.view(self._relations, rest)
-        if self._recent.resting <= self._count - case.first:  # it lied already when the body settled
+        bench = self._bench
+        rest = (self._hidden_columns() - case.cause.columns) | bench.recent.missing()
+        shown = bench.shown(rest)
+        if bench.recent.resting <= self._count - case.first:  # it lied already when the body settled
             shown = replace(shown, settled=np.full_like(shown.settled, np.nan))
-        evidence = self._judge(shown)
-        if self._count - case.first > AGAIN + LATELY and case.cause.columns & self._sudden(AGAIN):
+        evidence = bench.judge(shown)
+        if self._count - case.first > AGAIN + LATELY and case.cause.columns & bench.sudden(AGAIN):
             case.has_jumped = False
-        columns = sorted(case.cause.columns - self._recent.missing())
+        columns = sorted(case.cause.columns - bench.recent.missing())
         if not columns:
             return
-        if float(evidence.ratio.max(initial=0.0)) < CALM:
-            errors = np.abs(shown.z[:, columns] / self._judge.scale[columns])
-            is_silent = errors.max() < self._judge.least[columns].max()
+        if evidence.highest < CALM:
+            errors = np.abs(shown.z[:, columns] / bench.judge.scale[columns])
+            is_silent = errors.max() < bench.judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree
-            if case.cause.columns & self._recent.repeats.stuck:
+            if case.cause.columns & bench.recent.repeats.stuck:
                 return  # it agrees by chance
             if case.has_jumped and self._count - case.first < PATIENCE:
                 return  # it jumped away, and has not jumped back
-            if self._recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * self._judge.scale):
+            if bench.recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * bench.judge.scale):
                 return
-            if is_silent and np.isfinite(shown.z[:, columns]).all() and has_moved(case, shown, self._recent):
+            if is_silent and np.isfinite(shown.z[:, columns]).all() and has_moved(case, shown, bench.recent):
                 self._close(case)
             return
-        if self._count - case.first > SETTLED or case.cause.cause == "environment":
+        if self._count - case.first > SETTLED:
+            return
+        if case.cause.cause == "environment":
+            self._doubt_tool(case, evidence, rest)
             return
         self._describe(case, self._hidden_columns())
         if case.cause.cause not in ("element", "either"):
@@ -371,68 +365,54 @@ class TrustMonitor:
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "part" and case.cause.columns < again.columns:
             case.cause, case.may_be_body = again, True
-        elif again.cause == "element" and not again.columns & self._environment:
-            beyond = self._relations.beyond(self._schema, self._recent.values()[-1])
+        elif again.cause == "element" and not again.columns & bench.environment:
+            beyond = bench.relations.beyond(bench.schema, bench.recent.values()[-1])
             if case.yields_to(again, evidence, self._parts, beyond):
                 case.cause = again
                 self._describe(case, rest | again.columns)
 
+    def _doubt_tool(self, case: Case, evidence: Evidence, rest: Hidden) -> None:
+        """Drop another tool as the cause if no p explains all, and an element does with the p so far."""
+        bench = self._bench
+        left = bench.judge(bench.shown(rest | bench.environment)).highest
+        if bench.tool.proposed is not None and not case.cause.condition:
+            left = max(left, bench.under_proposed(rest, evidence))
+        if left >= CALM and self._explain(evidence, rest, False).cause == "element":
+            self._cases.remove(case)
+
     def _close(self, case: Case) -> None:
         """End a case; one without a plain lie may have been a contact, and such errors are usual from now on."""
+        bench = self._bench
         self._cases.remove(case)
         if case.cause.cause in ("element", "either", "all", "part") and not case.is_plain:
-            self._healthy.excuse(sorted(case.cause.columns), case.steps, case.is_hidden)
+            bench.healthy.excuse(sorted(case.cause.columns), case.steps, case.is_hidden)
 
     def _describe(self, case: Case, hidden: Hidden, is_noise: bool = False) -> None:
         """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
-        assert self._relations is not None and self._schema is not None
-        view, scale = self._recent.view(self._relations, hidden | case.cause.columns), self._judge.scale
-        is_noise |= case.kind == "noise" or self._recent.jumps.is_restless(case.cause.columns, view.healthy[-1] * scale)
-        describe(case, view, self._recent, self._relations, self._schema, scale, self._count, is_noise)
-
-    def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
-        noise, z = view.noises[-1].copy(), view.z.copy()
-        z[:, list(view.hidden)], noise[list(view.hidden)] = np.nan, np.nan
-        self._recent.jumps.learn(view.hidden)
-        if np.isfinite(z[-1]).any():
-            self._healthy.add(z, evidence.step, noise, motion)
-
-    def _fresh_judge(self) -> Judge:
-        return Judge(self._healthy, self._config.false_alarms, self._least)
+        bench = self._bench
+        view, scale = bench.shown(hidden | case.cause.columns), bench.judge.scale
+        is_noise |= case.kind == "noise" or bench.recent.jumps.is_restless(case.cause.columns, view.healthy[-1] * scale)
+        describe(case, view, bench.recent, bench.relations, bench.schema, scale, self._count, is_noise)
 
     def _explain(self, evidence: Evidence, hidden: Hidden, is_new: bool = True) -> Cause:
         """Return the most likely cause of an alarm; of one that is not new, without other tools and exchanges."""
-        assert self._relations is not None and self._schema is not None
-        age = int(evidence.age.flat[evidence.strength.argmax()])
+        bench = self._bench
+        age = evidence.newest
         parts, begun = remaining(self._parts, hidden, self._hidden_by_cases() & hidden)
         return explain(
-            evidence, self._without(hidden, age), self._joined, parts,
-            self._environment - hidden if is_new else frozenset(),
-            lambda: self._conditions(hidden, age),
-            self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
-            self._relations.beyond(self._schema, self._recent.values()[-1]),
-            (self._sudden(age) | self._recent.repeats.stuck) - hidden,
+            evidence, bench.without(hidden, age), self._joined, parts,
+            bench.environment - hidden if is_new else frozenset(),
+            lambda: bench.conditions(hidden, age),
+            bench.alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
+            bench.relations.beyond(bench.schema, bench.recent.values()[-1]),
+            (bench.sudden(age) | bench.recent.repeats.stuck | bench.moved_alone(age)) - hidden,
             begun,
+            self._jumped or frozenset(),
         )  # fmt: skip
 
-    def _sudden(self, age: int) -> Hidden:
-        """Return the columns that jumped within about the newest `age` blocks while all others moved as usual."""
-        assert self._view is not None
-        return self._recent.jumps.sudden(age, self._view.healthy[-1] * self._judge.scale)
-
-    def _without(self, hidden: Hidden, age: int = LONGEST) -> Callable[[Hidden], Evidence]:
-        """Return the evidence with more columns hidden; errors are usual that were there before `age` blocks."""
-        relations, judge = self._relations, self._judge
-        assert relations is not None
-
-        def without(more: Hidden) -> Evidence:
-            view = self._recent.view(relations, hidden | more)
-            return judge(view.scaled(view.usual(judge.scale, age + EARLIER)))
-
-        return without
-
     def _hidden_columns(self) -> Hidden:
-        by_hand = {self._place[p] for p in self._by_hand if p in self._place}
+        bench = self._bench
+        by_hand = {bench.place[p] for p in self._by_hand if p in bench.place}
         return self._hidden_by_cases() | by_hand
 
     def _hidden_by_cases(self) -> Hidden:
@@ -440,10 +420,11 @@ class TrustMonitor:
 
     def _at(self, case: Case) -> frozenset[int]:
         """Return the positions in the layout of a case's elements, without p."""
-        assert self._relations is not None
-        columns = [c for c in case.cause.columns if c < self._relations.count]
-        return frozenset(int(self._relations.columns[c]) for c in columns)
+        bench = self._bench
+        columns = [c for c in case.cause.columns if c < bench.relations.count]
+        return frozenset(int(bench.relations.columns[c]) for c in columns)
 
     def _finding(self, case: Case) -> Finding:
-        at = sorted(self._at(case), key=lambda p: (self._place[p] != case.cause.lead, p))
+        bench = self._bench
+        at = sorted(self._at(case), key=lambda p: (bench.place[p] != case.cause.lead, p))
         return case.finding(at, since=self._now - (self._count - case.began) * BLOCK)

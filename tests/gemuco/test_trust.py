@@ -174,8 +174,8 @@ def resting(arm, model, seed, blocks):
 def test_a_slow_drift_at_rest_is_hidden_and_an_end_of_it_is_seen(model, arm, element, rate):
     """At rest the errors of one posture do not change; a drift of 0.3 healthy errors per second was never found."""
     samples, monitor = resting(arm, model, 51, 450)
-    column = list(monitor._relations.columns).index(element)
-    healthy = (monitor._view.healthy[-1] * monitor._judge.scale)[column] * model.scaler.std[element]
+    column = list(monitor._bench.relations.columns).index(element)
+    healthy = (monitor._bench.view.healthy[-1] * monitor._bench.judge.scale)[column] * model.scaler.std[element]
     found = 200
     samples[:200, :, element] += healthy * rate * BLOCK * np.arange(200)[:, None]
     for index, block in enumerate(model.scaler.normalise(samples)):
@@ -194,7 +194,7 @@ def test_a_body_at_rest_is_trusted_also_if_it_creeps(model, arm):
     creeping = np.stack([np.interp(slow, np.arange(len(slow)), column) for column in moving], 1)
     samples[300:] = creeping.reshape(300, SAMPLES, 12) + random.normal(0.0, 1.0, samples[300:].shape) * NOISE
     monitor, hidden = watch(model, samples)
-    assert monitor._recent.resting > 10
+    assert monitor._bench.recent.resting > 10
     assert not any(hidden)
 
 
@@ -271,13 +271,13 @@ def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm
 def test_a_part_that_was_hidden_returns_when_it_agrees_and_the_next_one_needs_more_evidence(model, arm):
     samples = move(arm, 240, 31)
     monitor, _ = watch(model, samples[:150])
-    assert monitor._healthy.caution == 0.0
+    assert monitor._bench.healthy.caution == 0.0
     part = Cause(frozenset({TENSION, LENGTH}), "part", LENGTH)
     monitor._cases.append(Case(part, 150, 150, 150, steps=np.zeros(12), is_hidden=True))
     _, hidden = watch(model, samples[150:], monitor)
     assert hidden[0] == {TENSION, LENGTH}
     assert not hidden[-1]
-    assert monitor._healthy.caution > 1.0, "it agreed again by itself, and was perhaps right"
+    assert monitor._bench.healthy.caution > 1.0, "it agreed again by itself, and was perhaps right"
 
 
 def test_while_a_muscle_may_have_changed_other_sensors_are_accused_later(model, arm):

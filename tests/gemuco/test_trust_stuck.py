@@ -10,7 +10,7 @@ from gemuco.trust.changes import LONGEST
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.healthy import MOST_CAREFUL, Healthy
 from gemuco.trust.hypotheses import Cause, explain
-from gemuco.trust.stuck import CALM_BLOCKS, STUCK, Repeats
+from gemuco.trust.jumps import CALM_BLOCKS, STUCK, Repeats
 
 SAMPLES, KNOWN = 5, 200
 NOISY, COARSE = 0, 1

@@ -1,0 +1,157 @@
+"""The newest blocks of one body, and all that they are judged with: the evidence under any hypothesis about them."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from gemuco.schema import BodySchema
+from gemuco.trust.alternatives import Alternatives, is_another
+from gemuco.trust.changes import LONGEST, LastingTest
+from gemuco.trust.config import Hidden, TrustConfig
+from gemuco.trust.evidence import Evidence, Judge
+from gemuco.trust.healthy import Healthy
+from gemuco.trust.jumps import EARLIER, moved_alone
+from gemuco.trust.recent import Recent, View
+from gemuco.trust.relations import Relations
+from gemuco.trust.tool import JudgedTool
+
+LATELY = 10
+"""An alarm is new within this number of blocks after the change that caused it."""
+
+
+class Bench:
+    """Blocks, relations, limits and tests.
+
+    Attributes:
+        tool: The model to judge by.
+        relations: Its relations.
+        recent: The newest blocks.
+        healthy: What is known of the errors of this body.
+        judge: Limits and tests by what is healthy.
+        lasting: The test of changes that last longer than the newest blocks.
+        view: Errors of the newest blocks without the hidden columns; None before the first block.
+        place: Position in the layout -> column.
+        environment: The columns of p.
+    """
+
+    def __init__(self, tool: JudgedTool, relations: Relations, config: TrustConfig) -> None:
+        """Begin without blocks, for a model whose normal errors are known."""
+        schema, size = tool.schema, len(relations.columns)
+        assert schema.normal is not None
+        self.tool, self.relations, self._config = tool, relations, config
+        self.recent, self.healthy, self.lasting = Recent(), Healthy(size), LastingTest(size)
+        self.view: View | None = None
+        self._least = relations.sizes(schema, config)
+        self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
+        self.place = {int(position): column for column, position in enumerate(relations.columns)}
+        self.environment = frozenset(range(relations.count, size))
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Let the limits follow the healthy errors."""
+        self.judge = Judge(self.healthy, self._config.false_alarms, self._least)
+
+    @property
+    def schema(self) -> BodySchema:
+        """The model to judge by."""
+        return self.tool.schema
+
+    @property
+    def error(self) -> np.ndarray:
+        """Errors of a healthy prediction of the newest block [standard deviations], shape (columns,)."""
+        assert self.view is not None
+        return np.asarray(self.view.healthy[-1] * self.judge.scale)
+
+    @property
+    def is_known_tool(self) -> bool:
+        """Whether what is healthy was learned with the tool or load in use."""
+        return self._is_known(self.schema)
+
+    def _is_known(self, schema: BodySchema) -> bool:
+        return not is_another(self.schema, schema.bias, self._biases).all()
+
+    def look(self, hidden: Hidden, motion: float, since: int) -> Evidence:
+        """Judge the newest block.
+
+        Args:
+            hidden: Columns that are hidden or missing.
+            motion: Motion in the block [looks at a new posture].
+            since: Newly hidden columns have lied for about this number of blocks.
+        """
+        before = self.view
+        if before is not None and before.hidden - hidden:
+            self.recent.unsettle()  # one that returns may have lied when the body settled
+        view = self.view = self.shown(hidden)
+        if before is None or before.hidden != hidden:
+            self.lasting = LastingTest(len(self.relations.columns))
+            view = self.view = self._compared(view, before, since)
+        self.recent.find_repeats(view, self.judge.scale, motion)
+        looks = 0.0 if self.recent.resting else motion  # at rest sensor noise is no motion
+        self.lasting.add(view.z[-1] / self.judge.scale, self.judge.least, looks / self.judge.time)
+        return self.judge(view, self.lasting)
+
+    def _compared(self, view: View, before: View | None, since: int) -> View:
+        """Return a view with newly hidden columns, in which errors are usual that were there before they lied."""
+        known = self.recent.usual
+        if before is None or not before.hidden < view.hidden:
+            self.recent.usual = {columns: usual for columns, usual in known.items() if columns <= view.hidden}
+            return view
+        usual = view.usual(self.judge.scale, since + EARLIER)
+        known[view.hidden] = usual * known.get(view.hidden, 1.0)
+        return view.scaled(usual)
+
+    def without(self, hidden: Hidden, age: int = LONGEST) -> Callable[[Hidden], Evidence]:
+        """Return the evidence with more columns hidden; errors are usual that were there before `age` blocks."""
+
+        def without(more: Hidden) -> Evidence:
+            view = self.recent.view(self.relations, hidden | more)
+            return self.judge(view.scaled(view.usual(self.judge.scale, age + EARLIER)))
+
+        return without
+
+    def shown(self, hidden: Hidden) -> View:
+        """Return the errors of the newest blocks with some columns hidden."""
+        return self.recent.view(self.relations, hidden)
+
+    def alternatives(self, hidden: Hidden) -> Alternatives:
+        """Return other readings of the newest blocks."""
+        return Alternatives(self.schema, self.relations, self.recent, self.judge, hidden)
+
+    def conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:
+        """Yield each other trained condition, and the model's own p; see `explain`."""
+        schema, alternatives = self.schema, self.alternatives(hidden)
+        others = {name: schema.under(name) for name in schema.biases}
+        if self.tool.proposed is not None:
+            others[""] = self.tool.proposed
+        for name, other in others.items():
+            if not np.array_equal(other.bias, schema.bias):
+                yield name, alternatives.under(other, age), self._is_known(other)
+
+    def under_proposed(self, hidden: Hidden, evidence: Evidence) -> float:
+        """Return the largest evidence if the model's own p holds since the most likely change."""
+        assert self.tool.proposed is not None
+        other = self.alternatives(hidden - self.environment).under(self.tool.proposed, evidence.newest)
+        return other.highest
+
+    def sudden(self, age: int) -> Hidden:
+        """Return the columns that jumped within about the newest `age` blocks while all others moved as usual."""
+        return self.recent.jumps.sudden(age, self.error)
+
+    def moved_alone(self, age: int) -> Hidden:
+        """Return the element that moved within about the newest `age` blocks while all others rested."""
+        count = self.relations.count
+        return moved_alone(self.recent.values()[-age - EARLIER :, :count], self.error[:count])
+
+    def jumped(self, age: int) -> Hidden:
+        """Return all columns that jumped since about `age` blocks; none if that is long ago, or after a knock."""
+        return self.recent.jumps.jumped(age, self.error, self.relations.signals) if age <= LATELY else frozenset()
+
+    def learn(self, evidence: Evidence, motion: float) -> None:
+        """Learn what is healthy from the newest block."""
+        view = self.view
+        assert view is not None
+        noise, z, hidden = view.noises[-1].copy(), view.z.copy(), list(view.hidden)
+        z[:, hidden], noise[hidden] = np.nan, np.nan
+        self.recent.jumps.learn(view.hidden)
+        if np.isfinite(z[-1]).any():
+            self.healthy.add(z, evidence.step, noise, motion)
