@@ -191,12 +191,14 @@ class TrustMonitor:
             bench.tool.accept(bench.healthy.moved)
 
     def _believes_tool(self, evidence: Evidence, hidden: Hidden) -> bool:
-        """Whether to judge by the model's own p: nothing contradicts the one so far, or it explains what does."""
+        """Whether to judge by the model's own p; if it is another tool's, it needs to explain what is seen."""
         bench = self._bench
         highest, causes = evidence.highest, {case.cause.cause for case in self._cases}
         is_calm = highest < CALM and "environment" not in causes
-        if not bench.healthy.is_known or (is_calm and not bench.tool.is_another):
-            return True
+        if not bench.healthy.is_known or not bench.tool.is_another:
+            return not any(case.is_gross and not case.is_hidden for case in self._cases)
+        if self._count % AGAIN:
+            return False  # another reading costs as much as many blocks
         least = highest + RIVALS if is_calm else BETTER * highest if "body" in causes else CALM
         return bench.under_proposed(hidden, evidence) < least
 

@@ -1,0 +1,55 @@
+"""The model service in simulated time: its loops keep their rates, and a play of a lie has a result."""
+
+import numpy as np
+import pytest
+
+from gemuco import BodySchema, TrainConfig, fit
+from hal.config import load_robot
+from simulators.robots.pr2_duster.body import tool_tip
+from simulators.robots.pr2_duster.duster import GRASPS
+from studies.live.liars import JOINTS, TIP, arrivals, motion
+from studies.live.service import LiveService
+
+GRASP = "l300_phi0"
+
+
+@pytest.fixture(scope="module")
+def model() -> BodySchema:
+    robot, draw = load_robot("robots/pr2_duster.yaml"), np.random.default_rng(0)
+    low, high = robot.bounds(JOINTS)
+    positions = draw.uniform(low, high, (300, 7))
+    rows = {JOINTS: positions, TIP: tool_tip(GRASPS[GRASP], positions)}
+    episodes = [{name: value[i : i + 30] for name, value in rows.items()} for i in range(0, 300, 30)]
+    config = TrainConfig(hidden=(20, 20), latent=6, epochs=2, batch=50)
+    return fit(episodes, config, [(JOINTS,)], units={JOINTS: "rad", TIP: "m"})[0]
+
+
+def test_loops_keep_their_rates_and_a_covered_camera_is_estimated(model: BodySchema) -> None:
+    robot = load_robot("robots/pr2_duster.yaml")
+    positions = motion(robot, GRASP, 1, 4.0)
+    service, methods = LiveService(robot, model), []
+    for time, values, age in arrivals(positions, tool_tip(GRASPS[GRASP], positions), 3.0):
+        service.run_until(time)
+        if not age:
+            service.hal(values)
+        elif time < 2.0:
+            service.camera(values, age)
+        latest = service.model.estimation.latest
+        methods.append((time, latest.method[TIP] if latest is not None else "none"))
+    assert {method for time, method in methods if 0.2 < time < 2.0} == {"measured"}
+    assert {method for time, method in methods if time > 2.3} == {"mask"}
+    assert service.now == pytest.approx(time)
+    done = {loop.name: loop for loop in service.model.loops}
+    assert service.model.estimation.latest is not None
+    assert done["estimation"].rate == robot.rates.estimation
+    assert service.model.estimation.latest.cycle == pytest.approx(time * 50, abs=2)
+
+
+def test_motion_stays_within_the_limits_and_rests_now_and_then() -> None:
+    robot = load_robot("robots/pr2_duster.yaml")
+    positions = motion(robot, GRASP, 2, 20.0)
+    low, high = robot.bounds(JOINTS)
+    assert len(positions) >= 2000
+    assert (positions >= low).all() and (positions <= high).all()
+    rests = (np.diff(positions, axis=0) == 0.0).all(axis=1).mean()
+    assert 0.1 < rests < 0.9
