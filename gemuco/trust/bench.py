@@ -104,7 +104,7 @@ class Bench:
         """Return the evidence with more columns hidden; errors are usual that were there before `age` blocks."""
 
         def without(more: Hidden) -> Evidence:
-            view = self.recent.view(self.relations, hidden | more)
+            view = self.shown(hidden | more)
             return self.judge(view.scaled(view.usual(self.judge.scale, age + EARLIER)))
 
         return without

@@ -78,8 +78,8 @@ def explain(
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
-        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that
-            are stuck, or that moved while all others rested.
+        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck, or that
+            moved while all others rested.
         begun: Columns of parts of which another sensor is hidden already.
         jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
             not begun to lie.
@@ -130,7 +130,10 @@ def explain(
         if len(alike) == 1:
             return Cause(frozenset(alike), "element", alike[0])
         return Cause(frozenset(alike[:MOST]), "either", alike[0])
-    for columns, cause in _sets(singles, devices, parts, partners):
+    sets = _sets(singles, devices, parts, partners)
+    if len(jumped) > TOGETHER:  # all of them lie, or none does
+        sets = ((device, "all") for device in devices if jumped <= device)
+    for columns, cause in sets:
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)

@@ -9,8 +9,8 @@ from gemuco.trust.alternatives import is_another
 class JudgedTool:
     """The model that sensors are judged by: newest W, and p of the tool or load that is believed to be in use.
 
-    An online update that sees a lie may find a p that explains it for a posture or two. So its p is not taken as long
-    as another cause of what is seen may be a sensor.
+    An online update that sees a lie may find the p of another tool that explains it for a posture or two.
+    So that one is accepted only when it explains what contradicts the one so far.
 
     Attributes:
         schema: The model.
@@ -40,7 +40,7 @@ class JudgedTool:
 
     @property
     def is_another(self) -> bool:
-        """Whether the proposed p is that of another tool or load."""
+        """Whether the proposed p is that of another tool or load than the one judged by."""
         other = self.proposed
         return other is not None and bool(is_another(other, other.bias, self.schema.bias[None])[0])
 

@@ -6,6 +6,7 @@ from test_trust_jumps import ERROR, JOINT, LEARNED, LOAD, SIZE, TIP, after, evid
 from test_trust_tools import CHANGE, LAYOUT, SAMPLES, TOOLS, body, model, walk
 
 from gemuco.trust.config import BLOCK
+from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import explain
 from gemuco.trust.jumps import moved_alone
 from gemuco.trust.monitor import TrustMonitor
@@ -79,6 +80,17 @@ def test_what_did_not_jump_when_others_did_has_not_begun_to_lie() -> None:
     spared = explain(alarm, right, (), (), frozenset(), jumped=frozenset({TIP}))
     assert spared.cause == "body", "it explains the alarm, but the tip has jumped"
     assert explain(alarm, right, (), (), frozenset(), jumped=frozenset({JOINT})).columns == {JOINT}
+
+
+def test_a_device_whose_values_all_jump_is_the_cause_and_no_one_of_them() -> None:
+    alarm, jumped = evidence(JOINT, LOAD, TIP), frozenset({JOINT, LOAD, TIP})
+
+    def right(hidden: frozenset[int]) -> Evidence:
+        return evidence() if JOINT in hidden else alarm
+
+    cause = explain(alarm, right, (jumped,), (), frozenset(), jumped=jumped)
+    assert (cause.cause, cause.columns) == ("all", jumped)
+    assert explain(alarm, right, (frozenset({JOINT, LOAD}),), (), frozenset(), jumped=jumped).cause == "body"
 
 
 def test_the_only_one_that_moves_while_all_others_rest_is_named() -> None:
