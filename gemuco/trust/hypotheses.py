@@ -130,10 +130,7 @@ def explain(
         if len(alike) == 1:
             return Cause(frozenset(alike), "element", alike[0])
         return Cause(frozenset(alike[:MOST]), "either", alike[0])
-    sets = _sets(singles, devices, parts, partners)
-    if len(jumped) > TOGETHER:  # all of them lie, or none does
-        sets = ((device, "all") for device in devices if jumped <= device)
-    for columns, cause in sets:
+    for columns, cause in _sets(singles, devices, parts, partners, jumped):
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
@@ -242,8 +239,15 @@ def _sets(
     devices: Sequence[Hidden],
     parts: Sequence[Hidden],
     partners: Callable[[], Iterator[Hidden]],
+    jumped: Hidden,
 ) -> Iterator[tuple[Hidden, str]]:
-    """Yield the parts and devices that contain one of the first two candidates, and pairs."""
+    """Yield the parts and devices that contain one of the first two candidates, and pairs.
+
+    If many jumped, all of them lie or none does: then only devices that measure them all.
+    """
+    if len(jumped) > TOGETHER:
+        yield from ((device, "all") for device in devices if jumped <= device)
+        return
     first = set(singles[:2])
     yield from ((part, "part") for part in parts if part & first)
     yield from ((frozenset(pair), "all") for pair in combinations(singles[:3], 2))
