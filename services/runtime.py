@@ -36,12 +36,28 @@ def services_here() -> list[tuple[str, str]]:
     return sorted((robot, service) for (robot, _, service), lock in names if robot and _runs(lock))
 
 
+def own_line() -> str:
+    """Return what the lock of this process says: its pid and when it started."""
+    return f"{os.getpid()} {_started(os.getpid())}"
+
+
 def _runs(lock: Path) -> bool:
-    """Whether the process whose pid is in a lock's file exists; the file remains after its end.
+    """Whether the process that a lock's file names still runs; the file remains after its end.
 
     The lock itself is not tried: a process that starts at that moment would be refused.
     """
     try:
-        return Path(f"/proc/{int(lock.read_text())}").exists()
+        pid, started = lock.read_text().split()
+        return _started(int(pid)) == started
     except (OSError, ValueError):
         return False
+
+
+def _started(pid: int) -> str:
+    """Return when a process started [clock ticks since boot]: its pid may be another process's later.
+
+    Raises:
+        OSError: There is no such process.
+    """
+    after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]  # a name may contain anything
+    return after_name.split()[19]

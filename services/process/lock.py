@@ -3,14 +3,13 @@
 import contextlib
 import fcntl
 import logging
-import os
 from collections.abc import Iterable, Iterator
 from typing import IO
 
 import zenoh
 
 from services.errors import AlreadyRunning, NoAnswer, ServiceError
-from services.runtime import open_file, runtime_folder
+from services.runtime import open_file, own_line, runtime_folder
 from services.wire import keys, query
 from services.wire.session import address, close_session, open_with, settings
 
@@ -48,11 +47,11 @@ class ServiceLock:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.seek(0)
-            holder = file.read().strip()
+            holder = file.read().partition(" ")[0]
             file.close()
             raise AlreadyRunning(self._sentence(f"process {holder or 'unknown'} on this machine")) from None
         file.truncate(0)
-        file.write(str(os.getpid()))
+        file.write(own_line())
         file.flush()
         self._file = file
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from services.errors import AlreadyRunning
 from services.process.router import run_router
 from services.process.service import Service
-from services.runtime import services_here
+from services.runtime import own_line, runtime_folder, services_here
 from services.verbs import fleet_top
 from services.watch.fleet_watch import FleetWatch, RobotRecord, ServiceRecord
 from services.watch.service_rows import Level
@@ -177,6 +177,17 @@ def test_without_a_router_the_robots_of_this_machine_are_found(robot: str) -> No
             eventually(lambda: any(one.robot == robot and one.alive == {"hal"} for one in fleet.snapshots()))
         report.set()
         thread.join()
+
+
+def test_a_process_that_got_the_pid_of_a_service_that_ended_is_not_that_service(robot: str) -> None:
+    lock = runtime_folder() / f"{robot}.hal.lock"
+    lock.write_text(own_line())
+    assert (robot, "hal") in services_here()
+    pid, started = own_line().split()
+    for line in (f"{pid} {int(started) - 1}", pid, ""):
+        lock.write_text(line)
+        assert (robot, "hal") not in services_here()
+    lock.unlink()
 
 
 @pytest.mark.slow
