@@ -97,14 +97,15 @@ def _rows_of(
     estimated = estimate if estimate is not None and len(estimate.values.get(signal, ())) == len(elements) else None
     for index, element in enumerate(elements):
         age = math.nan if ages is None else float(ages[index])
-        is_fresh = newest is not None and newest.is_fresh and valid is not None and bool(valid[index])
-        # The model knows the robot file and applies its own age limits to what a camera measured.
         is_estimated = estimated is not None and bool(estimated.estimated[signal][index])
+        # The model knows the robot file and applies its own age limits to what a camera measured.
+        is_used = is_seen and estimated is not None and not is_estimated
+        is_fresh = newest is not None and (newest.is_fresh or is_used) and valid is not None and bool(valid[index])
         distrust = "" if estimate is None else estimate.distrusted.get(f"{signal}.{element}", "")
         is_hidden = (is_estimated and is_seen) or bool(distrust)
         if is_fresh and not is_hidden and values is not None:
             yield SignalRow(signal, element, unit, Kind.MEASURED, float(values[index]), age=age)
-        elif estimated is not None and np.isfinite(estimated.values[signal][index]):
+        elif estimated is not None and is_estimated and np.isfinite(estimated.values[signal][index]):
             yield SignalRow(
                 signal, element, unit, Kind.ESTIMATED, float(estimated.values[signal][index]),
                 float(estimated.std[signal][index]), age, estimated.mask[signal].replace("+", ", "),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from msgspec.structs import replace as msgspec_replace
 from rich.console import Console
-from talking_robot import BOTH, anomaly, estimates, sample, seen
+from talking_robot import BOTH, DESCRIBED, anomaly, estimates, sample, seen
 
 from services.verbs import top
 from services.view.markup import anomaly_html, signals_html
@@ -81,9 +81,23 @@ def test_without_a_fresh_estimate_a_lost_element_is_masked(estimate):
     assert math.isnan(row.value)
 
 
+def test_an_estimate_from_before_the_loss_is_none_of_the_lost_element():
+    row = signal_rows(seen(silent=True, estimate=Newest(estimates(False), 0.01)))[1]
+    assert row.kind is Kind.MASKED
+    assert math.isnan(row.value)
+
+
 def test_a_camera_that_no_service_described_is_still_hidden_when_the_model_says_so():
     moment = RobotSnapshot(robot="arm", vision=Newest(sample(), 0.1), estimate=Newest(estimates(True), 0.1))
     assert signal_rows(moment)[1].kind is Kind.ESTIMATED
+
+
+def test_the_value_of_a_slow_camera_is_measured_as_long_as_the_model_uses_it():
+    signals = {"signals": {"joint_position": DESCRIBED["signals"]["joint_position"] | {"source": "vision"}}}
+    for is_lost, kind in ((False, Kind.MEASURED), (True, Kind.ESTIMATED)):
+        report = Newest(estimates(is_lost), 0.1)
+        moment = RobotSnapshot(robot="arm", model=signals, vision=Newest(sample(), 0.9), estimate=report)
+        assert signal_rows(moment)[1].kind is kind
 
 
 FAULT = statuses(hal="fault", text="It broke.")
