@@ -1,6 +1,7 @@
 """The newest blocks of one body, and all that they are judged with: the evidence under any hypothesis about them."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,13 +11,20 @@ from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
-from gemuco.trust.jumps import EARLIER, moved_alone
+from gemuco.trust.hypotheses import SEARCHED
+from gemuco.trust.jumps import EARLIER, TOGETHER, moved_alone
 from gemuco.trust.recent import Recent, View
 from gemuco.trust.relations import Relations
 from gemuco.trust.tool import JudgedTool
 
 LATELY = 10
 """An alarm is new within this number of blocks after the change that caused it."""
+
+BLAMED = 0.8
+"""Of some columns that jumped, one has at least this share of the largest evidence."""
+DOUBTFUL, PLAIN, AMONG = 0.4, 1.5, 0.5
+"""From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
+second multiple of an alarm. One of them has at least the third share of the largest evidence."""
 
 
 class Bench:
@@ -30,6 +38,8 @@ class Bench:
         judge: Limits and tests by what is healthy.
         lasting: The test of changes that last longer than the newest blocks.
         view: Errors of the newest blocks without the hidden columns; None before the first block.
+        lied_when_settled: Whether the errors at the posture in which the body rests may be those of a lie with another
+            cause than the one that was hidden; then they are no excuse for those at the same posture.
         place: Position in the layout -> column.
         environment: The columns of p.
     """
@@ -41,6 +51,7 @@ class Bench:
         self.tool, self.relations, self._config = tool, relations, config
         self.recent, self.healthy, self.lasting = Recent(), Healthy(size), LastingTest(size)
         self.view: View | None = None
+        self.lied_when_settled = False
         self._least = relations.sizes(schema, config)
         self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
         self.place = {int(position): column for column, position in enumerate(relations.columns)}
@@ -109,19 +120,26 @@ class Bench:
 
         return without
 
+    def hides_another(self, ratio: np.ndarray, hidden: Hidden) -> bool:
+        """Whether one of the columns with the most evidence, shape (columns,), hides another one that is wrong too."""
+        without, least = self.without(hidden), AMONG * float(ratio.max())
+        order = [int(column) for column in np.argsort(-ratio)[:SEARCHED] if ratio[column] >= least]
+        return any(without(frozenset({column})).highest >= PLAIN for column in order)
+
     def shown(self, hidden: Hidden) -> View:
         """Return the errors of the newest blocks with some columns hidden."""
-        return self.recent.view(self.relations, hidden)
+        view = self.recent.view(self.relations, hidden)
+        return replace(view, settled=np.full_like(view.settled, np.nan)) if self.lied_when_settled else view
 
     def alternatives(self, hidden: Hidden) -> Alternatives:
         """Return other readings of the newest blocks."""
         return Alternatives(self.schema, self.relations, self.recent, self.judge, hidden)
 
     def conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:
-        """Yield each other trained condition, and the model's own p; see `explain`."""
+        """Yield each other trained condition, and the model's own p if it is another tool's; see `explain`."""
         schema, alternatives = self.schema, self.alternatives(hidden)
         others = {name: schema.under(name) for name in schema.biases}
-        if self.tool.proposed is not None:
+        if self.tool.proposed is not None and self.tool.is_another:
             others[""] = self.tool.proposed
         for name, other in others.items():
             if not np.array_equal(other.bias, schema.bias):
@@ -145,6 +163,15 @@ class Bench:
     def jumped(self, age: int) -> Hidden:
         """Return all columns that jumped since about `age` blocks; none if that is long ago, or after a knock."""
         return self.recent.jumps.jumped(age, self.error, self.relations.signals) if age <= LATELY else frozenset()
+
+    def began_with(self, evidence: Evidence) -> Hidden:
+        """Return all columns whose jumps began an alarm.
+
+        Few columns that contradict the others less than another one does only began to move.
+        """
+        jumped = self.jumped(evidence.newest)
+        is_cause = any(evidence.ratio[column] >= BLAMED * evidence.highest for column in jumped)
+        return jumped if is_cause or len(jumped) > TOGETHER else frozenset()
 
     def learn(self, evidence: Evidence, motion: float) -> None:
         """Learn what is healthy from the newest block."""

@@ -18,6 +18,8 @@ CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
 SURE = 2.0
 """Another cause replaces one if its evidence is this multiple."""
+YOUNG = 100
+"""What is seen within this number of blocks after an element was hidden may show that it was another one."""
 SAME = 0.3
 """An error and a jump are the same if they differ by less than this share of the jump."""
 MOVES = 3.0
@@ -95,6 +97,11 @@ class Case:
         self.may_be_body |= is_body and not is_sensor
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
+
+    def is_young(self, now: int, least: int = 0) -> bool:
+        """Whether it is an element that was hidden not long ago, `least` blocks or more, and did not certainly lie."""
+        is_sure = self.is_plain or not self.cause.is_element
+        return self.is_hidden and not is_sure and least <= now - self.first < YOUNG
 
     def changes(self, columns: Hidden, parts: Iterable[Hidden]) -> bool:
         """Whether the body may be another one for some columns; a part that has changed is so for all others."""

@@ -15,6 +15,8 @@ TOOL, EXPLAINED = 0.85, 0.6
 body changes what is measured by many sensors, and more is left of it. Another tool is believed below the first."""
 CANDIDATES = 5
 """This many columns with the most evidence are held against each other."""
+BEHIND = 0.5
+"""If none of them explains it, all others with at least this share of the largest evidence are tried."""
 SEARCHED = 6
 """Partners are searched for this many columns with the most evidence."""
 PLAUSIBLE = 0.4
@@ -50,6 +52,11 @@ class Cause:
     condition: str = ""
     is_exchange: bool = False
 
+    @property
+    def is_element(self) -> bool:
+        """Whether it is one element, or one of some that look alike."""
+        return self.cause in ("element", "either")
+
 
 def explain(
     evidence: Evidence,
@@ -73,8 +80,7 @@ def explain(
         parts: Columns that belong to one part of the body, such as a muscle, which may itself have changed.
         environment: The columns of p.
         conditions: Returns each other trained condition, the evidence under its p, and whether the healthy errors
-            under it are known; if not, a doubt is in favour
-            of the sensors.
+            under it are known; if not, a doubt is in favour of the sensors.
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
@@ -86,10 +92,7 @@ def explain(
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
-    singles = [int(c) for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and int(c) not in environment]
-    singles += sorted(sudden - environment - set(singles))
-    if jumped:
-        singles = [column for column in singles if column in jumped | sudden] if len(jumped) <= TOGETHER else []
+    singles, others = _candidates(evidence, environment, sudden, jumped)
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -108,6 +111,7 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
+    single = single or [column for column in others if solves(frozenset({column}))]
     strongest = set(order[:3].tolist())
     part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest), begun)
     for preferred in (sudden, part, beyond):
@@ -134,6 +138,24 @@ def explain(
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
+
+
+def _candidates(evidence: Evidence, environment: Hidden, sudden: Hidden, jumped: Hidden) -> tuple[list[int], list[int]]:
+    """Return the columns that are held against each other, and those that are tried if none of them explains it.
+
+    Args:
+        evidence: The evidence.
+        environment: The columns of p.
+        sudden: As in `explain`.
+        jumped: As in `explain`.
+    """
+    order = [int(c) for c in np.argsort(-evidence.strength)]
+    singles = [c for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and c not in environment]
+    singles += sorted(sudden - environment - set(singles))
+    if jumped:
+        return [c for c in singles if c in jumped | sudden] if len(jumped) <= TOGETHER else [], []
+    least = max(PLAUSIBLE, BEHIND * evidence.highest)
+    return singles, [c for c in order[CANDIDATES:] if evidence.ratio[c] >= least and c not in environment]
 
 
 def remaining(parts: Iterable[Hidden], hidden: Hidden, wrong: Hidden) -> tuple[list[Hidden], Hidden]:

@@ -7,12 +7,13 @@ import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
-from gemuco.trust.bench import LATELY, Bench
+from gemuco.trust.bench import DOUBTFUL, LATELY, Bench
 from gemuco.trust.cases import Case, LastSearch, describe, has_moved
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import RIVALS, SEARCHED, Cause, explain, remaining
+from gemuco.trust.hypotheses import RIVALS, Cause, explain, remaining
+from gemuco.trust.jumps import TOGETHER
 from gemuco.trust.relations import Relations
 from gemuco.trust.tool import JudgedTool
 
@@ -37,9 +38,6 @@ STRANGE = 1.8
 """If the errors without a cause are usually this multiple of those that were learned, no sensor is hidden."""
 LAPSES = 10
 """A suspicion ends if nothing speaks for it in this number of blocks."""
-DOUBTFUL, PLAIN, AMONG = 0.4, 1.5, 0.5
-"""From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
-second multiple of an alarm. One of them has at least the third share of the largest evidence."""
 UNEXPLAINED, ONCE_MORE = 3, 100
 """If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
@@ -47,6 +45,9 @@ GROSS, LONG, LIKE = 3.0, 50.0, 1.3
 jump or explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
 FITS = 0.1
 """Errors below this share of those with the lie count as no more than healthy ones."""
+HELD = 1.5
+"""Nor is one of the same tool judged by from this multiple of an alarm on: it would explain a growing lie step by step.
+But it is at once while the tool is new, or if many elements jumped, as they do when it slips."""
 BETTER = 0.5
 """Where no sensor explains the evidence, a p that leaves less than this share of it is judged by."""
 MOVED = 30.0
@@ -56,6 +57,10 @@ AT_ONCE, ONCE = 3, 15
 SUSPECT = 0.6
 """Of an element that jumped lately, this share of an alarm is one: with limits for one wrong verdict a week, so much
 less evidence is enough if a jump of a right element comes once in 20 minutes at most."""
+BESIDE = 2.0
+"""While an element is hidden, less is known of what is healthy: an alarm needs this multiple of the evidence."""
+ACQUAINTED = 60.0
+"""A body on which nothing was contradicted for this number of blocks of motion is known, whatever its scores are."""
 PATIENCE = 100
 """An element that jumped away returns after this number of blocks, or after it has jumped back."""
 Replaces = Callable[[frozenset[int]], bool]
@@ -104,7 +109,7 @@ class TrustMonitor:
         self._known = bench = None if relations is None else Bench(self._tool, relations, self._config)
         if relations is None or bench is None:
             return
-        self._other = self._motion = self._alarmed = 0.0
+        self._other = self._motion = self._alarmed = self._calm = 0.0
         self._search, self._missing = LastSearch(), Hidden()
         self._jumped: Hidden | None = None
         """The columns that jumped when the alarm that lasts began, and since, if any did; None without an alarm."""
@@ -134,7 +139,7 @@ class TrustMonitor:
         if any(case.is_hidden and case.changes(columns, self._parts) for case in self._cases):
             return False
         has_moved = bench.tool.seen_for(bench.healthy.moved) >= MOVED
-        return self.is_known and has_moved and bench.is_known_tool
+        return (self.is_known or self._calm >= ACQUAINTED) and has_moved and bench.is_known_tool
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -177,13 +182,14 @@ class TrustMonitor:
         hidden = self._hidden_columns() | self._missing
         if self._count % REFRESH == 0:
             bench.refresh()
+        bench.lied_when_settled = any(c.is_young(self._count, bench.recent.resting) for c in self._cases)
         began = max((case.began for case in self._cases if case.is_hidden), default=self._count)
         evidence = bench.look(hidden, motion, self._count - began + 1)
         if bench.healthy.is_known:
             self._decide(evidence, hidden, is_steady)
-        is_other = any(case.cause.cause == "body" for case in self._cases)
-        self._other = self._other + motion if is_other else 0.0
+        self._other = self._other + motion if any(c.cause.cause == "body" for c in self._cases) else 0.0
         is_quiet = evidence.highest < LEARNING
+        self._calm += motion * (evidence.highest < CALM and evidence.level < STRANGE and not hidden)
         if not bench.healthy.is_known or is_quiet or self._other > OTHER:
             bench.learn(evidence, motion)
         if bench.tool.proposed is not None and self._believes_tool(evidence, hidden):
@@ -195,7 +201,9 @@ class TrustMonitor:
         bench = self._bench
         highest, causes = evidence.highest, {case.cause.cause for case in self._cases}
         is_calm = highest < CALM and "environment" not in causes
-        if not bench.healthy.is_known or not bench.tool.is_another:
+        has_settled = bench.tool.seen_for(bench.healthy.moved) >= MOVED and len(self._jumped or ()) <= TOGETHER
+        is_held = has_settled and highest >= HELD
+        if not bench.healthy.is_known or not (bench.tool.is_another or is_held):
             return not any(case.is_gross and not case.is_hidden for case in self._cases)
         if self._count % AGAIN:
             return False  # another reading costs as much as many blocks
@@ -207,6 +215,8 @@ class TrustMonitor:
         bench = self._bench
         immune = [bench.place[p] for p in self._immune if p in bench.place]
         ratio = self._left(evidence, hidden)
+        if any(case.is_hidden for case in self._cases):
+            ratio /= BESIDE
         ratio[list(bench.sudden(LATELY))] /= SUSPECT
         stuck = list(bench.recent.repeats.stuck - hidden)
         ratio[stuck] = np.maximum(ratio[stuck], 1.0)
@@ -215,16 +225,18 @@ class TrustMonitor:
         if highest < CALM and not any(case.cause.cause == "environment" for case in self._cases):
             self._jumped = None
         elif highest >= 1.0 and self._jumped is None:
-            self._jumped = bench.jumped(evidence.newest) - hidden
+            self._jumped = bench.began_with(evidence) - hidden
         elif self._jumped:
             self._jumped |= bench.jumped(1) - hidden  # another lie may begin
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
         is_due = self._count % AGAIN == 0
         again = highest >= 1.0 and self._count % (AGAIN if self._is_known_body() else RARELY) == 0
+        if evidence.highest >= 1.0 and (self._alarmed == CONFIRMED or is_due) and self._reconsider(hidden):
+            return
         known, is_alarm = self._search.answer(self._cases, ratio, again), highest >= 1.0 and (is_steady or is_due)
         if known is not None:
             known.last, known.moved = self._count, known.moved + self._motion
-        elif is_alarm or (highest >= DOUBTFUL and is_due and self._hides_others(ratio, hidden)):
+        elif is_alarm or (highest >= DOUBTFUL and is_due and bench.hides_another(ratio, hidden)):
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
             highest = evidence.highest
@@ -235,6 +247,20 @@ class TrustMonitor:
                 self._judge_again(case)
         if immune and is_due and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
+
+    def _reconsider(self, hidden: Hidden) -> bool:
+        """Give a young case to another element if that explains also what contradicts the one so far; say whether."""
+        bench = self._bench
+        for case in [case for case in self._cases if case.is_young(self._count)]:
+            columns = case.cause.columns
+            evidence = bench.judge(bench.shown(hidden - columns))
+            again = self._explain(evidence, hidden - columns, is_new=False)
+            is_other = again.is_element and not again.columns & bench.environment and not again.columns <= columns
+            if is_other and evidence.strength[again.lead] > evidence.strength[list(columns)].max():
+                case.cause = again
+                self._describe(case, hidden - columns | again.columns)
+                return True
+        return False
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -291,14 +317,6 @@ class TrustMonitor:
         if highest >= 1.0 and case.cause.cause == "body":
             case.last = self._count
         return self._count - case.last > LAPSES
-
-    def _hides_others(self, ratio: np.ndarray, hidden: Hidden) -> bool:
-        """Whether one of the columns with the most evidence hides another one that is wrong too."""
-        bench = self._bench
-        without, least = bench.without(hidden), AMONG * float(ratio.max())
-        order = [int(column) for column in np.argsort(-ratio)[:SEARCHED] if ratio[column] >= least]
-        alone = (without(frozenset({column})).highest for column in order)
-        return any(highest >= PLAIN for highest in alone)
 
     def _limit_at_once(self, new: Case) -> None:
         """Take a change of many elements at once as one of the body, which hides none of them."""
@@ -362,7 +380,7 @@ class TrustMonitor:
             self._doubt_tool(case, evidence, rest)
             return
         self._describe(case, self._hidden_columns())
-        if case.cause.cause not in ("element", "either"):
+        if not case.cause.is_element:
             return
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "part" and case.cause.columns < again.columns:

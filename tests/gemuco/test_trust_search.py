@@ -63,6 +63,7 @@ def test_a_body_that_is_not_known_is_searched_rarely(model, arm, monkeypatch):
     samples[BEGIN:, :, JOINT] += 0.3  # rad
     monitor = TrustMonitor(model, replaces=lambda elements: False)
     monitor.is_known = False
+    monkeypatch.setattr("gemuco.trust.monitor.ACQUAINTED", np.inf)
     made = [count for count in searches(monkeypatch, monitor, model.scaler.normalise(samples)) if count > BEGIN]
     alone = [count for count in made if count > BEGIN + 20]
     assert any(count <= BEGIN + 6 for count in made)
