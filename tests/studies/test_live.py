@@ -7,6 +7,8 @@ from gemuco import BodySchema, TrainConfig, fit
 from hal.config import load_robot
 from simulators.robots.pr2_duster.body import tool_tip
 from simulators.robots.pr2_duster.duster import GRASPS
+from studies.accuracy.lies import Body
+from studies.live import bodies
 from studies.live.liars import JOINTS, TIP, arrivals, motion
 from studies.live.service import LiveService
 
@@ -53,3 +55,20 @@ def test_motion_stays_within_the_limits_and_rests_now_and_then() -> None:
     assert (positions >= low).all() and (positions <= high).all()
     rests = (np.diff(positions, axis=0) == 0.0).all(axis=1).mean()
     assert 0.1 < rests < 0.9
+
+
+@pytest.mark.parametrize("kind", ["offset", "frozen", "drift", "none"])
+def test_lies_of_recorded_motion_are_played_to_the_service(model: BodySchema, kind: str, monkeypatch) -> None:
+    monkeypatch.setattr(bodies, "BEFORE", 1)
+    monkeypatch.setattr(bodies, "AFTERWARDS", 1)
+    joints = np.repeat(motion(load_robot("robots/pr2_duster.yaml"), GRASP, 3, 4.0), 2, axis=0)
+    rows = model.scaler.normalise(np.c_[joints, tool_tip(GRASPS[GRASP], joints)])
+    columns, given = np.arange(10), []
+    body = Body(model, {"": rows}, columns, np.full(10, 0.1), np.zeros((11, 10)), np.ones(10))
+    monkeypatch.setattr(LiveService, "hal", lambda self, values: given.append(values[JOINTS]))
+    monkeypatch.setattr(LiveService, "camera", lambda self, values, age: given.append(values[TIP]))
+    outcome = bodies.play(load_robot("robots/pr2_duster.yaml"), body, kind, 1, learns=False)
+    assert bool(outcome.liar) == (kind != "none")
+    assert np.isnan(outcome.delay) and not outcome.wrong
+    assert outcome.size > 0.0
+    assert len(given) == 2 * 2 * bodies.RATE - bodies.LATE, "the camera's values come late"
