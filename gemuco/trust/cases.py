@@ -18,6 +18,8 @@ CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
 SURE = 2.0
 """Another cause replaces one if its evidence is this multiple."""
+LAPSES = 10
+"""A suspicion ends if nothing speaks for it in this number of blocks."""
 YOUNG = 100
 """What is seen within this number of blocks after an element was hidden may show that it was another one."""
 SAME = 0.3
@@ -97,6 +99,12 @@ class Case:
         self.may_be_body |= is_body and not is_sensor
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
+
+    def has_lapsed(self, now: int, highest: float) -> bool:
+        """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""
+        if highest >= 1.0 and self.cause.cause == "body":
+            self.last = now
+        return now - self.last > LAPSES
 
     def is_young(self, now: int, least: int = 0) -> bool:
         """Whether it is an element that was hidden not long ago, `least` blocks or more, and did not certainly lie."""

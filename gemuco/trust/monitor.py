@@ -36,8 +36,6 @@ OTHER = 100.0
 is healthy is learned from it, and small lies are noticed no more."""
 STRANGE = 1.8
 """If the errors without a cause are usually this multiple of those that were learned, no sensor is hidden."""
-LAPSES = 10
-"""A suspicion ends if nothing speaks for it in this number of blocks."""
 UNEXPLAINED, ONCE_MORE = 3, 100
 """If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
@@ -46,7 +44,7 @@ jump or explains the second number of blocks of motion, and leaves errors below 
 FITS = 0.1
 """Errors below this share of those with the lie count as no more than healthy ones."""
 HELD = 1.5
-"""Nor is one of the same tool judged by from this multiple of an alarm on: it would explain a growing lie step by step.
+"""From this multiple of an alarm on, p of the same tool is not followed: it would explain a growing lie step by step.
 But it is at once while the tool is new, or if many elements jumped, as they do when it slips."""
 BETTER = 0.5
 """Where no sensor explains the evidence, a p that leaves less than this share of it is judged by."""
@@ -240,7 +238,7 @@ class TrustMonitor:
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
             highest = evidence.highest
-            for case in [c for c in self._cases if not c.is_hidden and self._has_lapsed(c, highest)]:
+            for case in [c for c in self._cases if not c.is_hidden and c.has_lapsed(self._count, highest)]:
                 self._close(case)
         if is_due:
             for case in [case for case in self._cases if case.is_hidden]:
@@ -255,12 +253,19 @@ class TrustMonitor:
             columns = case.cause.columns
             evidence = bench.judge(bench.shown(hidden - columns))
             again = self._explain(evidence, hidden - columns, is_new=False)
-            is_other = again.is_element and not again.columns & bench.environment and not again.columns <= columns
+            is_other = again.is_element and not again.columns <= columns and self._may_take(again, case)
             if is_other and evidence.strength[again.lead] > evidence.strength[list(columns)].max():
                 case.cause = again
                 self._describe(case, hidden - columns | again.columns)
                 return True
         return False
+
+    def _may_take(self, cause: Cause, case: Case) -> bool:
+        """Whether the elements of a cause may be hidden in place of those of a case."""
+        elements, others = self._at(replace(case, cause=cause)), self.hidden - self._at(case)
+        is_sensor = not cause.columns & self._bench.environment
+        is_used = cause.cause == "either" and self._config.pairs == "use"
+        return is_sensor and not is_used and not self._immune & elements and self._replaces(others | elements)
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -311,12 +316,6 @@ class TrustMonitor:
             if case.cause.cause != "environment":
                 self._cases.remove(case)
                 self._immune.update(self._at(case))
-
-    def _has_lapsed(self, case: Case, highest: float) -> bool:
-        """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""
-        if highest >= 1.0 and case.cause.cause == "body":
-            case.last = self._count
-        return self._count - case.last > LAPSES
 
     def _limit_at_once(self, new: Case) -> None:
         """Take a change of many elements at once as one of the body, which hides none of them."""
@@ -385,7 +384,7 @@ class TrustMonitor:
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "part" and case.cause.columns < again.columns:
             case.cause, case.may_be_body = again, True
-        elif again.cause == "element" and not again.columns & bench.environment:
+        elif again.cause == "element" and self._may_take(again, case):
             beyond = bench.relations.beyond(bench.schema, bench.recent.values()[-1])
             if case.yields_to(again, evidence, self._parts, beyond):
                 case.cause = again

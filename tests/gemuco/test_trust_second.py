@@ -88,6 +88,31 @@ def test_a_wrong_suspect_is_shown_again_and_the_right_one_hidden(model, seed):
     assert GRAVITY not in monitor.hidden
 
 
+@pytest.mark.parametrize("rule", ["trusted by hand", "not replaced", "body"])
+def test_a_case_is_not_given_to_an_element_that_must_not_be_hidden(model, rule, monkeypatch):
+    replaced = {GRAVITY} if rule == "not replaced" else set(range(LAYOUT.size))
+    monitor = TrustMonitor(model, replaces=lambda elements: elements <= replaced)
+    rows = body(walk(CHANGE + 2, 80), TOOLS["short"])
+    for number, block in enumerate(blocks_of(model, rows)):
+        monitor.add(block, number * BLOCK)
+    hide(monitor, GRAVITY)
+    bench = monitor._bench
+    monkeypatch.setattr(monitor, "_describe", lambda *_: None)
+    if rule == "trusted by hand":
+        monitor._immune = {SHOULDER}
+    columns = bench.environment if rule == "body" else frozenset({bench.place[SHOULDER]})
+    cause = Cause(columns, "element", min(columns))
+    monkeypatch.setattr(monitor, "_explain", lambda evidence, hidden, is_new=True: cause)
+    evidence = bench.judge(bench.shown(frozenset()))
+    strength = np.zeros(len(evidence.strength))
+    strength[min(columns)] = 50.0
+    monkeypatch.setattr(bench, "judge", lambda view: replace(evidence, strength=strength))
+    assert not monitor._reconsider(monitor._hidden_columns())
+    assert monitor.hidden == {GRAVITY}
+    monitor._immune, replaced = set(), set(range(LAYOUT.size))
+    assert monitor._reconsider(monitor._hidden_columns()) == (rule != "body")
+
+
 def test_few_that_jumped_and_contradict_less_than_another_only_began_to_move(model, monkeypatch):
     monitor = TrustMonitor(model)
     for number, block in enumerate(blocks_of(model, body(walk(CHANGE, 71), TOOLS["short"]))):
