@@ -10,14 +10,13 @@ kind `none` are healthy plays.
 
 import argparse
 import logging
+from functools import partial
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from hal.config import RobotConfig, load_robot
 from studies.accuracy.lies import RATE, Body, body_of, under
-from studies.live.liars import LIES, SOON, Play, row_of
+from studies.live.liars import LIES, Play, show
 from studies.live.service import LiveService
 
 ROBOTS = "musashi_arm", "kxr_humanoid"
@@ -73,11 +72,5 @@ if __name__ == "__main__":
     logging.disable(logging.WARNING)
     for name in options.robots:
         robot, body = load_robot(f"robots/{name}.yaml"), body_of(name)
-        table = Table(name, "plays", "hidden", f"in {SOON:.0f} s", "median", "a right one hidden", "at the end")
-        for kind in options.kinds:
-            seeds = range(options.first, options.first + options.plays)
-            played = [play(robot, body, kind, seed, not options.still) for seed in seeds]
-            table.add_row(*row_of(kind, played))
-            for outcome in played:
-                print(outcome, flush=True)
-        Console(width=120).print(table)
+        seeds = range(options.first, options.first + options.plays)
+        show(name, options.kinds, seeds, partial(play, robot, body, learns=not options.still))

@@ -17,8 +17,9 @@ noise, and kept in runs/lies.
 import argparse
 import logging
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from rich.console import Console
@@ -150,6 +151,17 @@ def row_of(kind: str, played: list[Play]) -> tuple[str, ...]:
     )
 
 
+def show(title: str, kinds: Iterable[str], seeds: range, play: Callable[[str, int], Play]) -> None:
+    """Play every kind with every seed; print all plays and a table with a row per kind."""
+    table = Table(title, "plays", "hidden", f"in {SOON:.0f} s", "median", "a right one hidden", "at the end")
+    for kind in kinds:
+        played = [play(kind, seed) for seed in seeds]
+        table.add_row(*row_of(kind, played))
+        for one in played:
+            print(one, flush=True)
+    Console(width=120).print(table)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plays", type=int, default=12, help="Plays of each kind.")
@@ -159,11 +171,5 @@ if __name__ == "__main__":
     options = parser.parse_args()
     logging.disable(logging.WARNING)
     robot, schema = load_robot("robots/pr2_duster.yaml"), model_of("pr2_duster")
-    table = Table("what happens", "plays", "hidden", f"in {SOON:.0f} s", "median", "a right one hidden", "at the end")
-    for kind in options.kinds:
-        seeds = range(options.first, options.first + options.plays)
-        played = [play(robot, schema, kind, seed, not options.still) for seed in seeds]
-        table.add_row(*row_of(kind, played))
-        for one in played:
-            print(one, flush=True)
-    Console(width=120).print(table)
+    seeds = range(options.first, options.first + options.plays)
+    show("what happens", options.kinds, seeds, partial(play, robot, schema, learns=not options.still))
