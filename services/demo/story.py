@@ -229,16 +229,16 @@ class Story:
         for _ in range(CUT_POSES):
             self._go_as_cut()
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
-        element = mode([anomaly.blamed for anomaly in early] or [""])
         verdicts, end = self._distrusted_of_muscle(), self._timeline.now()
+        by = ["the test for lies"] * bool(verdicts) + ["the anomaly detection"] * bool(early)
         # Without the distrusted length the score is of the other muscles.
         self.marks.blamed = MUSCLE if verdicts else self._blamed_muscle(early)
         peak = float(np.nanmax(self._timeline.between("score", start, self.marks.alarm + 1.0)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
             f"anomaly score {score:.1f} before the cut, then up to {peak:.1f}, threshold {limit:.1f}",
-            f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
-            f"muscle with the largest part in the score: {self._blamed_muscle(early) or 'none'}",
+            f"reported after {1e3 * (self.marks.alarm - start):.0f} ms by {' and '.join(by) or 'nothing'}",
+            *self._blame(early),
             f"before anything was wrong an anomaly was reported {alarms:.1%} of the time",
             *(f"{name} is {why}; motion needs it, so the arm stays off" for name, why in verdicts),
         )
@@ -290,6 +290,16 @@ class Story:
             for _ in range(LEARNING_POSES):
                 self._go(self._pose(), LEARNING_TIME)
             self._report(f"    Statistics of normal errors learned anew from {self._learn_normal()} samples.")
+
+    def _blame(self, anomalies: list[Anomaly]) -> list[str]:
+        """Return a line on what the anomaly detection names; none if it reports nothing before the arm stops."""
+        if not anomalies:
+            return []
+        element = mode(anomaly.blamed for anomaly in anomalies)
+        return [
+            f"the anomaly detection: largest part of the score from the muscle {self._blamed_muscle(anomalies)}, of "
+            f"single elements from {element}"
+        ]
 
     def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:
         """Return the muscle whose tension and length together contribute most; empty without anomalies."""

@@ -108,13 +108,12 @@ def _troubles(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> Iterator[Tr
 
 
 def _gone(snapshot: RobotSnapshot) -> Trouble:
-    hint = f"Is {starter('hal')} running?"
     if not math.isfinite(snapshot.age):
-        return Trouble(Level.GONE, "No robot", hint)
+        return Trouble(Level.GONE, "No robot", f"Is '{snapshot.robot}' its name, and is {starter('hal')} running?")
     since = f"Nothing has been heard for {snapshot.age:.0f} s."
     if any(newest.message.state == "stopping" for newest in snapshot.statuses.values()):
         return Trouble(Level.GONE, "Robot gone", f"{since} It was stopped on request.")
-    return Trouble(Level.GONE, "Robot gone", f"{since} {hint}")
+    return Trouble(Level.GONE, "Robot gone", f"{since} Is {starter('hal')} running?")
 
 
 def _services(snapshot: RobotSnapshot) -> Iterator[Trouble]:
