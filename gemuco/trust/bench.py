@@ -1,5 +1,6 @@
 """The newest blocks of one body, and all that they are judged with: the evidence under any hypothesis about them."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -19,7 +20,8 @@ from gemuco.trust.tool import JudgedTool
 
 LATELY = 10
 """An alarm is new within this number of blocks after the change that caused it."""
-
+OUTSIDE = 1.8
+"""A sample is outside of what was learned if the model's errors are expected to be this multiple of those inside."""
 BLAMED = 0.8
 """Of some columns that jumped, one has at least this share of the largest evidence."""
 DOUBTFUL, PLAIN, AMONG = 0.4, 1.5, 0.5
@@ -52,6 +54,8 @@ class Bench:
         self.recent, self.healthy, self.lasting = Recent(), Healthy(size), LastingTest(size)
         self.view: View | None = None
         self.lied_when_settled = False
+        self._outside: deque[bool] = deque(maxlen=LONGEST)
+        """Whether each of the newest blocks is outside of what was learned, where errors of any size are healthy."""
         self._least = relations.sizes(schema, config)
         self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
         self.place = {int(position): column for column, position in enumerate(relations.columns)}
@@ -61,6 +65,7 @@ class Bench:
     def refresh(self) -> None:
         """Let the limits follow the healthy errors."""
         self.judge = Judge(self.healthy, self._config.false_alarms, self._least)
+        self.recent.lateness = self.healthy.lateness
 
     @property
     def schema(self) -> BodySchema:
@@ -77,6 +82,11 @@ class Bench:
     def is_known_tool(self) -> bool:
         """Whether what is healthy was learned with the tool or load in use."""
         return self._is_known(self.schema)
+
+    def was_outside(self, age: int) -> bool:
+        """Whether the body was outside of what was learned shortly before the newest `age` blocks."""
+        before = list(self._outside)[: max(len(self._outside) - age, 1)]
+        return any(before[-EARLIER:])
 
     def _is_known(self, schema: BodySchema) -> bool:
         return not is_another(self.schema, schema.bias, self._biases).all()
@@ -96,9 +106,11 @@ class Bench:
         if before is None or before.hidden != hidden:
             self.lasting = LastingTest(len(self.relations.columns))
             view = self.view = self._compared(view, before, since)
+        outside = self.relations.outside(self.schema, self.recent.values()[-1:], view.z[-1:] * view.healthy[-1:])
+        self._outside.append(bool(outside > OUTSIDE) and not self.relations.is_linear)
         self.recent.find_repeats(view, self.judge.scale, motion)
         looks = 0.0 if self.recent.resting else motion  # at rest sensor noise is no motion
-        self.lasting.add(view.z[-1] / self.judge.scale, self.judge.least, looks / self.judge.time)
+        self.lasting.add(view.standard(self.judge.scale)[-1], self.judge.least, looks / self.judge.time)
         return self.judge(view, self.lasting)
 
     def _compared(self, view: View, before: View | None, since: int) -> View:
@@ -121,7 +133,12 @@ class Bench:
         return without
 
     def hides_another(self, ratio: np.ndarray, hidden: Hidden) -> bool:
-        """Whether one of the columns with the most evidence, shape (columns,), hides another one that is wrong too."""
+        """Whether one of the columns with the most evidence hides another one that is wrong too.
+
+        Outside of what was learned all predictions are wrong, and fewer columns may not show that it is outside.
+        """
+        if any(self._outside):
+            return False
         without, least = self.without(hidden), AMONG * float(ratio.max())
         order = [int(column) for column in np.argsort(-ratio)[:SEARCHED] if ratio[column] >= least]
         return any(without(frozenset({column})).highest >= PLAIN for column in order)
@@ -181,4 +198,4 @@ class Bench:
         z[:, hidden], noise[hidden] = np.nan, np.nan
         self.recent.jumps.learn(view.hidden)
         if np.isfinite(z[-1]).any():
-            self.healthy.add(z, evidence.step, noise, motion)
+            self.healthy.add(z, evidence.step, noise, motion, view.timing[-1] / self.recent.lateness)

@@ -81,7 +81,7 @@ class Judge:
 
     def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
         """Return the evidence in a view; without `lasting` from its blocks alone."""
-        step, best = self._steps(view.z / self.scale, view.moved)
+        step, best = self._steps(view.standard(self.scale), view.moved)
         ratio, strength, age = step / self._limit, 0.5 * step**2, np.array(AGES)[best]
         if lasting is not None:
             likelihood = lasting.likelihood
@@ -136,6 +136,6 @@ def _level(view: View, scale: np.ndarray) -> float:
     """
     used = np.ones(view.z.shape[1], bool)
     used[list(view.hidden)] = False
-    z = (view.z / scale)[:, used][-RECENT:]
+    z = view.standard(scale)[:, used][-RECENT:]
     z = z[np.isfinite(z).all(axis=1)]
     return float(np.median(np.sqrt(np.mean(z**2, axis=0)))) if z.size else 0.0

@@ -34,6 +34,11 @@ evidence is needed from then on, up to the second number; it is forgotten in thi
 what was learned too, for a while."""
 NOISE_KNOWN = 20
 """The usual noise of a column is known after this number of blocks in which it was measured."""
+LATE, SEEN, LATENESS = 0.4, 30.0, (0.05, 4.0)
+"""Values of two signals are assumed to be apart by the first multiple of `TIMING`, which counts as the second number of
+blocks. The multiple is at least and at most the third pair."""
+CLEAR = 9.0
+"""The square of one error counts as at most this multiple of its expected one."""
 RESTS = 0.2
 """Slower than this share of its usual pace the body is at rest."""
 
@@ -49,10 +54,14 @@ class Healthy:
         self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
         self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
         self._pace = LEAST_PACE
+        self._late = np.array([LATE**2, 1.0]) * SEEN
+        """Weighted sums of the squares of the errors' parts by timing, and of the squares that `TIMING` would cause."""
         self._noise, self._noise_count = np.full((2, size), 1e-6), np.zeros((2, size))
         """This is the noise at rest and in motion: values of a fast motion do not fit each other as well."""
 
-    def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float) -> None:
+    def add(
+        self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float, timing: np.ndarray | None = None
+    ) -> None:
         """Learn from one block; columns whose newest error is NaN keep what they have.
 
         Args:
@@ -60,6 +69,7 @@ class Healthy:
             steps: Result of the step test, shape (n,).
             noise: Variance of the noise within the block, in the same units, shape (n,); NaN where unknown.
             motion: Result of `motion`; a body at rest shows the same errors again and again.
+            timing: Errors of values that are apart by `TIMING`, in the unit of `z`, shape (n,); by default none.
         """
         self.count += 1
         self.moved += motion
@@ -68,7 +78,9 @@ class Healthy:
         share = doubted * motion / min(PRIOR + self.moved, MEMORY)
         now = z[-1]
         is_new = np.isfinite(now)
-        square = np.clip(np.where(is_new, now**2, self._square), 0.0, 9.0 * self._square)
+        if timing is not None:
+            self._learn_lateness(now, timing)
+        square = np.clip(np.where(is_new, now**2, self._square), 0.0, CLEAR * self._square)
         self._square += share * (square - self._square)
         for lag, name in ((1, "_near"), (APART, "_far")):
             mean, product = getattr(self, name), now * z[-1 - lag] / self._square
@@ -83,6 +95,21 @@ class Healthy:
         share = weight / np.clip(self._noise_count, 1.0, MEMORY)
         change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
         self._noise += share * (change - self._noise)
+
+    def _learn_lateness(self, now: np.ndarray, timing: np.ndarray) -> None:
+        """Learn how far values are apart in time.
+
+        Args:
+            now: The newest errors, shape (n,); NaN where missing.
+            timing: Errors of values that are apart by `TIMING`, shape (n,).
+        """
+        square = self.scale**2
+        whole, known = square + (self.lateness * timing) ** 2, np.isfinite(now * timing)
+        weight = np.where(known, (timing / whole) ** 2, 0.0)
+        beyond = np.where(known, np.clip(now**2, 0.0, CLEAR * whole) - square, 0.0)
+        sums = np.array([(weight * beyond).sum(), (weight * np.nan_to_num(timing) ** 2).sum()])
+        sums /= max(1.0, sums[1])  # a block counts once, not once for each of its columns
+        self._late += sums - self._late * sums[1] / MEMORY
 
     def excuse(self, columns: list[int], steps: np.ndarray, was_hidden: bool) -> None:
         """Learn that an alarm was none, because it ended by itself.
@@ -115,6 +142,11 @@ class Healthy:
     def scale(self) -> np.ndarray:
         """Standard deviation of the errors on this body, in units of the learned ones, shape (n,)."""
         return np.clip(np.sqrt(self._square), *SCALES)
+
+    @property
+    def lateness(self) -> float:
+        """Standard deviation of the time between values that count as of one time, as a multiple of `TIMING`."""
+        return float(np.clip(np.sqrt(max(self._late[0], 0.0) / self._late[1]), *LATENESS))
 
     @property
     def noise(self) -> np.ndarray:

@@ -342,6 +342,8 @@ class TrustMonitor:
         is_sure = case.is_gross and (case.moved >= LONG or case.jumped_alone)
         if left > STRANGE or not (self._is_known_body(case.cause.columns) or is_sure):
             return "what is normal is not known on this body"
+        if bench.was_outside(self._count - case.began + 1) and not is_sure:
+            return "the body was outside of what was learned"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
         return "" if self._replaces(self.hidden | elements) else "the model cannot replace it"
@@ -360,7 +362,7 @@ class TrustMonitor:
         if not columns:
             return
         if evidence.highest < CALM:
-            errors = np.abs(shown.z[:, columns] / bench.judge.scale[columns])
+            errors = np.abs(shown.standard(bench.judge.scale)[:, columns])
             is_silent = errors.max() < bench.judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree

@@ -13,6 +13,7 @@ from gemuco.trust.config import Hidden
 from gemuco.trust.jumps import Jumps, Repeats
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
+from gemuco.trust.timing import Shift, changes
 
 JERKS = 0.5
 """Noise of an element exceeds this share of the noise in what the others predict of it."""
@@ -36,6 +37,7 @@ class View:
     Attributes:
         z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
         healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
+        timing: Errors of values that are not quite of one time, in the unit of `z`, shape (LONGEST, n).
         noises: Variance of the noise within each of the `NOISY` newest blocks [squared errors of a healthy body], shape
             (blocks, n); NaN where unknown.
         hidden: The hidden columns.
@@ -48,6 +50,7 @@ class View:
 
     z: np.ndarray
     healthy: np.ndarray
+    timing: np.ndarray
     noises: np.ndarray
     hidden: Hidden
     settled: np.ndarray
@@ -63,6 +66,14 @@ class View:
         median = 0.5 * (ordered[middle // 2, columns] + ordered[(middle + 1) // 2, columns])
         return np.where(2 * count > len(ordered), median, np.nan)
 
+    def standard(self, scale: np.ndarray) -> np.ndarray:
+        """Return the errors in the standard deviations of this body and of the timing, shape (LONGEST, n).
+
+        Args:
+            scale: This body's errors [unit of `z`], shape (n,).
+        """
+        return np.asarray(self.z / np.hypot(scale, self.timing))
+
     def usual(self, scale: np.ndarray, age: int) -> np.ndarray:
         """Return which multiple of a healthy body's the errors were before the newest blocks, at least 1, shape (n,).
 
@@ -70,7 +81,7 @@ class View:
             scale: A healthy body's errors [unit of `z`], shape (n,).
             age: Number of the newest blocks.
         """
-        before = self.z[: max(LONGEST - age, 0)] / (LARGER * scale)
+        before = self.standard(scale)[: max(LONGEST - age, 0)] / LARGER
         known = np.isfinite(before)
         count = known.sum(axis=0)
         square = (np.where(known, before, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1)
@@ -78,12 +89,18 @@ class View:
 
     def scaled(self, usual: np.ndarray) -> "View":
         """Return the same errors, if these multiples of a healthy body's errors are usual, shape (n,)."""
-        return replace(self, z=self.z / usual, healthy=self.healthy * usual, settled=self.settled / usual)
+        timing = self.timing / usual
+        return replace(
+            self, z=self.z / usual, healthy=self.healthy * usual, timing=timing, settled=self.settled / usual
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Block:
-    """Samples of one block: mean, features of mean and samples, range and absence of every column, network errors."""
+    """Samples of one block: mean, features of mean and samples, range and absence of every column, network errors.
+
+    `shift` says what is different in it if a signal is late.
+    """
 
     mean: np.ndarray
     features: np.ndarray
@@ -91,6 +108,7 @@ class _Block:
     span: np.ndarray
     missing: np.ndarray
     sensed: Sensed
+    shift: Shift
 
 
 class _Errors(NamedTuple):
@@ -100,12 +118,14 @@ class _Errors(NamedTuple):
         newest: Number of the newest of them.
         errors: Errors [standard deviations of the signal], shape (blocks, columns).
         healthy: Those of a healthy body, shape (blocks, columns).
+        timing: Those of values that are apart by `TIMING`, shape (blocks, columns).
         noises: As in `View`.
     """
 
     newest: int
     errors: np.ndarray
     healthy: np.ndarray
+    timing: np.ndarray
     noises: np.ndarray
 
 
@@ -123,9 +143,13 @@ class Recent:
         self._schema: BodySchema
         """This is the schema of the newest block."""
         self._samples = np.zeros((0, 0))
+        self._last: np.ndarray | None = None
+        """The last sample of the block before, shape (1, columns)."""
         self.jumps, self.repeats = Jumps(), Repeats()
         self.usual: dict[Hidden, np.ndarray] = {}
         """Multiples of a healthy body's errors that are usual while these columns are hidden, shape (columns,)."""
+        self.lateness = 0.0
+        """Values of two signals are apart by this multiple of `TIMING`."""
         self.resting = 0
         """This number of blocks ago the body had settled at its posture; 0 in motion."""
 
@@ -133,7 +157,8 @@ class Recent:
         """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
         self._schema = schema
         rows = rows_of(schema, samples)[:, relations.columns]
-        self._samples = rows[:, : relations.count]
+        since = rows if self._last is None else np.concatenate([self._last, rows])
+        self._samples, self._last = rows[:, : relations.count], rows[-1:]
         self.jumps.add(self._samples)
         finite = np.isfinite(rows)
         missing = finite.sum(axis=0) * 2 < len(rows)
@@ -142,11 +167,13 @@ class Recent:
         mean[~missing] = np.nan_to_num(np.nanmean(rows[:, ~missing], axis=0)) if (~missing).any() else 0.0
         span = np.full(rows.shape[1], np.nan)
         span[~missing] = np.ptp(np.where(finite, rows, mean)[:, ~missing], axis=0)
-        full = np.full((1 + len(whole), len(rows_of(schema, samples[:1])[0])), np.nan)
-        full[0, relations.columns], full[1:, relations.columns] = mean, whole
-        features = relations.features(full)
-        sensed = relations.sensitivity.sense(schema, full[:1])
-        self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
+        late, (halves, weights) = changes(since, relations.signals), _halves(whole)
+        along = np.where(missing, np.nan, np.concatenate([mean[None], halves]))
+        features = relations.features(relations.rows(schema, np.concatenate([along, mean + late, whole])))
+        own, shifted, each = np.split(features, [len(along), len(along) + len(late)])
+        sensed = relations.sensitivity.along(schema, relations.rows(schema, along), weights)
+        shift = Shift(late[None], shifted[None] - own[:1])
+        self.blocks.append(_Block(mean, weights @ own, each, span, missing, sensed, shift))
         self._count += 1
 
     def rest(self, motion: float, looks: Callable[[float], float]) -> None:
@@ -193,7 +220,7 @@ class Recent:
     def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
         """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
         other = Recent()
-        other._moved, other._schema = self._moved.copy(), schema
+        other._moved, other._schema, other.lateness = self._moved.copy(), schema, self.lateness
         full = relations.rows(schema, values)
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))
@@ -229,15 +256,15 @@ class Recent:
         used[list(hidden)] = False
         known, missing = self._errors_without(relations, hidden), np.array([block.missing for block in self.blocks])
         healthy = known.healthy * self.usual.get(hidden, 1.0)
-        z = known.errors / healthy
+        z, timing = known.errors / healthy, self.lateness * known.timing / healthy
         z[np.any(missing & used, axis=1)] = np.nan
         z[missing] = np.nan
         if len(z) < LONGEST:
             lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
-            z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
+            z, healthy, timing = (np.concatenate([lacking, part]) for part in (z, healthy, timing))
         settled, moved = self._errors_when_settled(relations, hidden, used), np.array(self._moved) - self._moved[-1]
         settled = np.where(self._away < 1.0, settled, np.nan)
-        return View(z, healthy, known.noises, hidden, settled, self._away, moved, len(self.blocks[-1].each))
+        return View(z, healthy, timing, known.noises, hidden, settled, self._away, moved, len(self.blocks[-1].each))
 
     def _errors_without(self, relations: Relations, hidden: Hidden) -> _Errors:
         """Return the errors with some columns hidden; only those of blocks that are new are computed."""
@@ -247,7 +274,7 @@ class Recent:
             known = _Errors(self._count, *self._judged(relations, hidden, list(self.blocks)))
         elif fresh:
             own = self._judged(relations, hidden, list(self.blocks)[-fresh:])
-            kept = zip(before[1:], own, (LONGEST, LONGEST, NOISY), strict=True)
+            kept = zip(before[1:], own, (LONGEST, LONGEST, LONGEST, NOISY), strict=True)
             known = _Errors(self._count, *(np.concatenate([old, new])[-most:] for old, new, most in kept))
         else:
             known = before
@@ -256,17 +283,16 @@ class Recent:
         self._errors[hidden] = known
         return known
 
-    def _judged(
-        self, relations: Relations, hidden: Hidden, blocks: Sequence[_Block]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return errors, those of a healthy body, and noises of some blocks; see `_Errors`."""
+    def _judged(self, relations: Relations, hidden: Hidden, blocks: Sequence[_Block]) -> tuple[np.ndarray, ...]:
+        """Return the errors of some blocks, and what is known of those of a healthy body; see `_Errors`."""
         features = np.array([block.features for block in blocks])
         sensed = Sensed.joined(block.sensed for block in blocks)
         means = np.array([block.mean for block in blocks])
-        errors, healthy, _ = relations.judged(self._schema, hidden, features, sensed, means)
+        shift = Shift.joined(block.shift for block in blocks)
+        judged = relations.judged(self._schema, hidden, features, sensed, means, shift)
         relation, newest = relations.without(hidden), blocks[-NOISY:]
         noises = np.array([_noise(block.each, relation.maps) for block in newest])
-        return errors, healthy, noises / relation.healthy(features[-NOISY:]) ** 2
+        return judged.errors, judged.healthy, judged.timing, noises / relation.healthy(features[-NOISY:]) ** 2
 
     def find_repeats(self, view: View, scale: np.ndarray, motion: float) -> None:
         """Find the elements that are stuck after the newest block.
@@ -286,11 +312,11 @@ class Recent:
         settled = self._settled
         if settled is None or (settled.missing & used).any():
             return np.full(len(used), np.nan)
-        errors, healthy, size = relations.judged(
-            self._schema, hidden, settled.features[None], settled.sensed, settled.mean[None]
+        judged = relations.judged(
+            self._schema, hidden, settled.features[None], settled.sensed, settled.mean[None], settled.shift
         )
-        is_unknown = settled.missing | (size[0] > FREE)
-        return np.where(is_unknown, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
+        is_unknown = settled.missing | (judged.size[0] > FREE)
+        return np.where(is_unknown, np.nan, (judged.errors / judged.healthy)[0] / self.usual.get(hidden, 1.0))
 
     def clear(self) -> None:
         """Forget all blocks."""
@@ -307,6 +333,22 @@ def exchanged(schema: BodySchema, relations: Relations, values: np.ndarray, one:
     std, mean = schema.scaler.std[relations.columns[pair]], schema.scaler.mean[relations.columns[pair]]
     result[:, pair[::-1]] = (values[:, pair] * std + mean - mean[::-1]) / std[::-1]
     return result
+
+
+def _halves(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means of both halves of a block, shape (2, columns), and weights of its mean and of these.
+
+    The mean of an arm's postures is none of its postures: in a fast motion what follows from it differs from the mean
+    of what follows from each sample. What follows from all three, weighted, is that mean if the motion is even and the
+    function of second order.
+    """
+    half = len(rows) // 2
+    if not half:
+        return rows[:0], np.ones(1)
+    places = np.arange(len(rows)) - 0.5 * (len(rows) - 1)
+    bend = np.mean(places**2) / np.mean(places[-half:]) ** 2
+    halves = np.stack([rows[:half].mean(axis=0), rows[-half:].mean(axis=0)])
+    return halves, np.array([1.0 - bend, 0.5 * bend, 0.5 * bend])
 
 
 def _mean(blocks: Sequence[_Block]) -> _Block:

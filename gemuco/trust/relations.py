@@ -5,6 +5,7 @@ wrong needs predictions without it. They all follow from the second moments of t
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from gemuco.normal.watch import error_growth, without_features
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import LINEAR, Sensed, Sensitivity
+from gemuco.trust.timing import Shift
 
 STRAIGHT, CURVED, FURTHEST = 2.0, 6.0, 5.0
 """Outside of the learned range of an element, by a share of it, the network's errors are larger by the exponential of
@@ -89,6 +91,22 @@ class Relation:
         return np.asarray((np.einsum("ij,ij->i", features, scaled)[:, None] - removed).clip(min=0.0))
 
 
+class Judged(NamedTuple):
+    """Errors of samples with some columns hidden, arrays of shape (n, columns) [standard deviations of the signal].
+
+    Attributes:
+        errors: The errors.
+        healthy: Those of a healthy body whose values are of one time.
+        size: Its multiple of the usual one, larger where a value follows less from the others.
+        timing: Errors of values of two signals that are apart by `TIMING`.
+    """
+
+    errors: np.ndarray
+    healthy: np.ndarray
+    size: np.ndarray
+    timing: np.ndarray
+
+
 class Relations:
     """All relations of one schema; each is computed at its first use."""
 
@@ -115,7 +133,9 @@ class Relations:
         rows = schema.normal.rows.astype(float)
         self._rows, self._known = self.features(rows), rows
         self.sensitivity = Sensitivity(schema, self.columns)
-        self._steepness = STRAIGHT if _is_linear(schema) else CURVED
+        self.is_linear = _is_linear(schema)
+        """Whether every output is linear, so that it is right outside of what was learned too."""
+        self._steepness = STRAIGHT if self.is_linear else CURVED
         self._sensed = self.sensitivity.sense(schema, rows)
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
@@ -233,12 +253,17 @@ class Relations:
         return spread, calibration, np.where(known, ratio, np.nan)
 
     def judged(
-        self, schema: BodySchema, hidden: Hidden, features: np.ndarray, sensed: Sensed, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the errors of samples with some columns hidden, those of a healthy body, and the size of these.
+        self,
+        schema: BodySchema,
+        hidden: Hidden,
+        features: np.ndarray,
+        sensed: Sensed,
+        values: np.ndarray,
+        shift: Shift | None = None,
+    ) -> Judged:
+        """Return the errors of samples with some columns hidden, and what is known of those of a healthy body.
 
-        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better. The
-        size is a multiple of the usual one, larger where a value follows less from the others. Shapes (n, columns).
+        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
 
         Args:
             schema: The schema.
@@ -246,11 +271,13 @@ class Relations:
             features: Features of the samples, shape (n, features).
             sensed: Errors of the network at the samples.
             values: Values of the judged columns, p included [standard deviations], shape (n, columns).
+            shift: What is different in the samples if a signal is late; by default nothing is, as at rest.
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
         growth, size = healthy / relation.std, relation.by_watch(values)
         healthy = np.maximum(healthy * size, self._least)
+        timing = np.zeros((len(values), 1, len(self.columns))) if shift is None else shift.features @ relation.maps
         if relation.network.any():
             sensed, off = self._sensed_without(schema, hidden, errors, sensed, values)
             lies, spread = self.sensitivity.lies(sensed, hidden)
@@ -259,12 +286,15 @@ class Relations:
             spread = spread * relation.calibration * np.maximum(1.0, growth) * by_network
             spread = np.maximum(spread, self._coarse)
             better = relation.network & np.isfinite(spread)
-            spread *= self._outside(schema, values, errors, np.where(better, lies, errors))
+            spread *= self.outside(schema, values, errors, np.where(better, lies, errors))
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
             size = np.where(better, by_network, size)
-        return errors, healthy, size
+            if shift is not None and shift.values.any():
+                own = self.sensitivity.moved(sensed, hidden, shift.values)
+                timing = np.where(better[:, None], own, timing)
+        return Judged(errors, healthy, size, np.sqrt((timing**2).sum(axis=1)))
 
-    def _outside(self, schema: BodySchema, values: np.ndarray, *errors: np.ndarray) -> np.ndarray:
+    def outside(self, schema: BodySchema, values: np.ndarray, *errors: np.ndarray) -> np.ndarray:
         """Return how much larger the network's errors are at samples outside of the learned ranges, shape (n, 1).
 
         A sample is outside if the others predict an element there too; a sensor that only shows such a value says

@@ -112,6 +112,17 @@ class Sensitivity:
         """Return what the errors of samples followed by p say, shape (n, size + bias_size)."""
         return Sensed.of(*self.errors(schema, rows), self._precision)
 
+    def along(self, schema: BodySchema, rows: np.ndarray, weights: np.ndarray) -> Sensed:
+        """Return what the weighted mean of the errors of some rows says, with the derivatives at the first one.
+
+        Args:
+            schema: The schema.
+            rows: Samples followed by p, shape (n, size + bias_size).
+            weights: Their weights, shape (n,).
+        """
+        errors, slopes = self.errors(schema, rows)
+        return Sensed.of(weights @ errors[None], slopes[:1], self._precision)
+
     def errors(self, schema: BodySchema, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of samples followed by p, shape (n, size + bias_size), and their derivatives.
 
@@ -186,3 +197,10 @@ class Sensitivity:
             far = (np.abs(value[:, away]) > limit).any(axis=1)
             spread[far] = np.inf
         return value, spread
+
+    def moved(self, sensed: Sensed, hidden: Hidden, changes: np.ndarray) -> np.ndarray:
+        """Return the lies that changes of all columns would suggest, shape (n, k, columns) like the changes."""
+        count, information = changes.shape[1], sensed.information
+        evidence = (changes @ information).reshape(-1, changes.shape[2])
+        value, _ = self.lies(Sensed(np.repeat(information, count, axis=0), evidence), hidden, limit=np.inf)
+        return value.reshape(changes.shape)

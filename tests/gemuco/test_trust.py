@@ -103,8 +103,8 @@ def test_how_wrong_a_hidden_element_is_changes_nothing_of_the_others(model, arm,
             own = rows.copy()
             own[:, element] += wrong
             values, sensed = own[:, relations.columns], relations.sensitivity.sense(model, own)
-            error, healthy, _ = relations.judged(model, hidden, relations.features(own), sensed, values)
-            return error / healthy
+            judged = relations.judged(model, hidden, relations.features(own), sensed, values)
+            return judged.errors / judged.healthy
 
         sees_network |= bool(relations.without(hidden).network[others].any())
         assert np.abs(errors(off) - errors(0.0))[:, others].max() < 0.5

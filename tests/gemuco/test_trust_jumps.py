@@ -145,7 +145,15 @@ def test_errors_that_were_large_before_a_change_are_usual() -> None:
     z[-5:, JOINT] += 8.0
     z[:25, LOAD] = np.nan
     view = View(
-        z, np.ones_like(z), np.zeros((1, SIZE)), frozenset(), none, np.zeros(SIZE), np.arange(LONGEST, dtype=float), 20
+        z,
+        np.ones_like(z),
+        np.zeros_like(z),
+        np.zeros((1, SIZE)),
+        frozenset(),
+        none,
+        np.zeros(SIZE),
+        np.arange(LONGEST, dtype=float),
+        20,
     )
     usual = view.usual(np.ones(SIZE), 8)
     assert usual[TIP] == pytest.approx(8.0 / 1.5, rel=0.1)

@@ -57,7 +57,7 @@ def hidden_in(model, rows):
     return first
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 1, 2, 10, 11, 16, 25])
 def test_no_sensor_is_hidden_where_nothing_was_learned(model, seed):
     position = np.concatenate([walk(200, seed, LEARNED), walk(600, 10 + seed, HIGH)])
     assert (position[:, 0] > 0.3).mean() > 0.2

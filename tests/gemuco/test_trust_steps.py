@@ -118,10 +118,8 @@ def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     size = 3.0
     judge = Judge(healthy, 0.006, np.full(2, size))
     noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
-    unknown = np.full(2, np.nan)
-    evidence = judge(
-        View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, np.zeros(2), MOVING, 20)
-    )
+    unknown, none = np.full(2, np.nan), np.zeros((LONGEST, 2))
+    evidence = judge(View(none, none + 1.0, none, noises, frozenset(), unknown, np.zeros(2), MOVING, 20))
     assert evidence.is_noise.tolist() == [is_noise, False]
     assert (evidence.ratio[0] >= 1.0) == is_noise
 
