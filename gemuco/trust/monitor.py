@@ -292,8 +292,7 @@ class TrustMonitor:
         bench = self._bench
         known = next((case for case in self._cases if not case.is_hidden and case.cause.cause == cause.cause), None)
         if known is not None and known.cause.columns == cause.columns:
-            known.seen, known.last = known.seen + 1, self._count
-            known.moved += self._motion
+            known.seen, known.last, known.moved = known.seen + 1, self._count, known.moved + self._motion
         else:
             self._cases = [case for case in self._cases if case.is_hidden]
             began = self._count - int(evidence.age[cause.lead]) + 1

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from gemuco.schema import BodySchema
+from gemuco.trust.aligned import Shift, changes
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import Hidden
 from gemuco.trust.jumps import Jumps, Repeats
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
-from gemuco.trust.timing import Shift, changes
 
 JERKS = 0.5
 """Noise of an element exceeds this share of the noise in what the others predict of it."""

@@ -15,9 +15,9 @@ from gemuco.intervals.region import learned_range
 from gemuco.normal.local import Grid, LocalSize
 from gemuco.normal.watch import error_growth, without_features
 from gemuco.schema import BodySchema
+from gemuco.trust.aligned import Shift
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import LINEAR, Sensed, Sensitivity
-from gemuco.trust.timing import Shift
 
 STRAIGHT, CURVED, FURTHEST = 2.0, 6.0, 5.0
 """Outside of the learned range of an element, by a share of it, the network's errors are larger by the exponential of

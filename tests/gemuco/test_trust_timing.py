@@ -8,10 +8,10 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.signals import Layout, Signal
+from gemuco.trust.aligned import TIMING, Shift, changes
 from gemuco.trust.config import BLOCK
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.relations import Relations, rows_of
-from gemuco.trust.timing import TIMING, Shift, changes
 
 LAYOUT = Layout((Signal("joint_position", 3, "rad"), Signal("tool_tip_position", 3, "m", ("x", "y", "z"))))
 SAMPLES, NOISE, LATE = 5, 2e-4, 0.02
