@@ -8,6 +8,7 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.signals import Layout, Signal
+from gemuco.trust import aligned
 from gemuco.trust.aligned import TIMING, Shift, changes
 from gemuco.trust.config import BLOCK
 from gemuco.trust.monitor import TrustMonitor
@@ -72,6 +73,13 @@ def watch(model, rows):
 def test_a_fast_motion_is_no_lie(model, seed):
     """The mean posture of a block is none of its postures, so what follows from it is wrong in a fast motion."""
     assert watch(model, motion(80.0, [SLOW] * 9 + [FAST], seed))[1] == set()
+
+
+def test_right_sensors_are_rarely_hidden_beside_a_late_tip(model, monkeypatch):
+    moves = [motion(60.0, [0.2, 0.5, 1.0, 0.3, 2.0], seed, 0.5 * LATE) for seed in range(4, 8)]
+    assert sum(bool(watch(model, rows)[1]) for rows in moves) <= 1
+    monkeypatch.setattr(aligned, "TIMING", 1e-9)
+    assert sum(bool(watch(model, rows)[1]) for rows in moves) >= 3, "without it they are"
 
 
 @pytest.mark.parametrize("late", [0.0, LATE])
