@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -57,6 +58,10 @@ REFUSED = "Unknown channel ID: "
 """foxglove-sdk 0.30 advertises a new channel before it accepts subscriptions to it, and reports one that is earlier."""
 
 
+ACCEPTED = 0.5
+"""A subscription that was not refused within this time [s] is accepted; the server says nothing then."""
+
+
 class Viewer:
     """A client of the WebSocket protocol `foxglove.sdk.v1`: JSON for control, binary opcode 1 for message data."""
 
@@ -66,6 +71,7 @@ class Viewer:
         self.newest: dict[str, bytes] = {}
         self.logged, self.count = b"", 0
         self._subscribed: dict[int, str] = {}
+        self._asked = time.monotonic()
         self._stop = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
 
@@ -105,7 +111,12 @@ class Viewer:
             number = len(self._subscribed) + 1
             self._subscribed[number] = channel["topic"]
             wanted.append({"id": number, "channelId": channel["id"]})
+        self._asked = time.monotonic()
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def is_subscribed(self, topic: str) -> bool:
+        """Whether a channel was advertised, and no subscription was refused for half a second."""
+        return topic in self.channels and time.monotonic() - self._asked > ACCEPTED
 
     def json(self, topic: str) -> dict[str, Any]:
         return json.loads(self.newest[topic]) if topic in self.newest else {}
@@ -138,6 +149,7 @@ def test_a_viewer_sees_what_is_measured_and_what_is_estimated(robot: str, frames
         assert schemas[f"/{robot}/joint_states"] == "foxglove.JointStates"
         assert schemas[log] == "foxglove.Log"
         assert "rad" in viewer.channels[joint]["schema"]
+        eventually(lambda: viewer.is_subscribed(log))  # each of its lines is sent once
         talking.silent = True
         eventually(lambda: viewer.json(joint)["elbow"].get("estimated") == -0.48)  # the sample came before it
         lost = viewer.json(joint)["elbow"]
