@@ -298,7 +298,7 @@ class Story:
         element = mode(anomaly.blamed for anomaly in anomalies)
         return [
             f"the anomaly detection: largest part of the score from the muscle {self._blamed_muscle(anomalies)}, of "
-            f"single elements from {element}"
+            f"single elements from {element or 'none'}"
         ]
 
     def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:

@@ -64,6 +64,30 @@ def test_no_sensor_is_hidden_where_nothing_was_learned(model, seed):
     assert hidden_in(model, body(position, seed)) == {}
 
 
+def go(position, goal):
+    """Return the way from a position to a goal [rad] at full speed, shape (samples, 3)."""
+    step, way = SPEED * BLOCK / SAMPLES, [position]
+    while not np.array_equal(way[-1], goal):
+        left = goal - way[-1]
+        way.append(np.where(np.abs(left) <= step, goal, way[-1] + np.sign(left) * step))
+    return np.array(way[1:])
+
+
+@pytest.mark.parametrize("off", [0.05, 0.3])
+def test_a_lie_that_began_there_is_hidden_when_the_body_is_back(model, off):
+    random, parts = np.random.default_rng(100), [walk(200, 0, LEARNED)]
+    outside = np.array([0.8, 0.2, 0.3])
+    parts += [go(parts[-1][-1], outside), np.repeat(outside[None], 10 * SAMPLES, axis=0)]
+    back = sum(map(len, parts))
+    while sum(map(len, parts)) < back + 60 * SAMPLES:
+        parts.append(go(parts[-1][-1], random.uniform(LOW, LEARNED)))
+    rows = body(np.concatenate(parts), 0)[: (back + 60 * SAMPLES) // SAMPLES * SAMPLES]
+    rows[back - 5 * SAMPLES :, 1] += off
+    first = hidden_in(model, rows)
+    assert list(first) == ["joint_position.1"]
+    assert first["joint_position.1"] <= back // SAMPLES + 50
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_joint_sensor_that_only_shows_such_a_place_is_hidden(model, seed):
     rows = body(walk(500, seed, LEARNED), seed)
