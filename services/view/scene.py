@@ -28,10 +28,12 @@ POINT = ("x", "y", "z")
 """A signal in m with these elements is shown as a point."""
 VIEW = np.array([1.0, -0.6, 0.3]) / np.linalg.norm([1.0, -0.6, 0.3])
 """The camera looks at the robot from this direction."""
+MOVED = 0.01
+"""A camera this far from where it was put, as a share of the robot's radius, was moved by the person."""
 MARGIN = 1.1
 """The picture is this factor larger than the robot."""
 PHONE, TOP = 0.75, 0.44
-"""In a picture with a smaller ratio of width to height, viser's panel covers all but this upper share."""
+"""In a window with a smaller ratio of width to height, viser's panel covers all but this upper share."""
 FULL_TENSION = 100.0
 """Wires without a limit have their last color at this tension [N]."""
 GAMMA = 2.2
@@ -111,14 +113,14 @@ class Scene:
                 self._show_figures(self._body, self._kinds, snapshot, rows)
             self._show_points(rows)
 
-    def fit(self, aspect: float, field: float) -> tuple[np.ndarray, np.ndarray]:
+    def fit(self, aspect: float, field: float, top: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Return position and target of a camera [m], each of shape (3,), that sees the whole robot.
 
         Args:
             aspect: Width of the picture divided by its height.
             field: Vertical field of view [rad].
+            top: Upper share of the picture that no panel covers.
         """
-        top = TOP if aspect < PHONE else 1.0
         tall = math.tan(field / 2.0)
         half = math.atan(min(top, aspect) * tall)
         distance = MARGIN * self._radius / math.sin(half)
@@ -194,9 +196,29 @@ class Scene:
         self._site.on_client_connect(self._fit_client)
 
     def _fit_client(self, client: "viser.ClientHandle") -> None:
-        """Fit the camera to the width of a new browser window, such as a phone's."""
-        with client.atomic():
-            client.camera.position, client.camera.look_at = self.fit(client.camera.aspect, client.camera.fov)
+        """Fit the camera to a new browser window and to each new shape of its picture, until the person moves it.
+
+        A browser first reports the shape of the whole window, and later that of the picture beside the panels.
+        """
+        camera = client.camera
+        top = TOP if camera.aspect < PHONE else 1.0
+        fitted = np.zeros(3)
+        shape = 0.0
+
+        def fit() -> None:
+            nonlocal fitted, shape
+            shape = camera.aspect
+            fitted, target = self.fit(shape, camera.fov, top)
+            with client.atomic():
+                camera.position, camera.look_at = fitted, target
+
+        def refit(_: "viser.CameraHandle") -> None:
+            is_moved = np.linalg.norm(camera.position - fitted) > MOVED * self._radius
+            if camera.aspect != shape and not is_moved:
+                fit()
+
+        fit()
+        camera.on_update(refit)
 
 
 def _sensed(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> dict[str, float]:

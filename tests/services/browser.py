@@ -23,6 +23,8 @@ class Browser:
 
     def __init__(self, port: int, origin: str | None = None, token: str = "") -> None:
         self._messages: dict[str, dict[str, Any]] = {}
+        self.camera: list[tuple[float, ...]] = []
+        """Positions that the page gave to the camera, the newest last."""
         self._socket = connect(
             f"ws://127.0.0.1:{port}/{token}", subprotocols=[f"viser-v{viser.__version__}"], origin=origin, max_size=None
         )  # type: ignore[arg-type]
@@ -44,6 +46,10 @@ class Browser:
 
     def say(self, message: dict[str, Any]) -> None:
         self._socket.send(msgspec.msgpack.encode(message))
+
+    def look(self, width: int, height: int, position: tuple[float, ...] | None = None) -> None:
+        """Report the camera in a picture of this size; it stays where the page put it, or is moved by hand."""
+        self.say(CAMERA | {"image_width": width, "image_height": height, "position": position or self.camera[-1]})
 
     def text(self) -> str:
         """All HTML of the page, one piece after the other."""
@@ -100,6 +106,8 @@ class Browser:
         if message["type"] == "LocalStorageGetItemRequestMessage":
             answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
             self.say({"type": "LocalStorageGetItemResponseMessage", **answer})
+        elif message["type"] == "SetCameraPositionMessage":
+            self.camera.append(tuple(message["position"]))
         elif message["type"] == "GuiUpdateMessage":
             self._messages.setdefault(uuid, {}).update(message["updates"])
         elif message["type"].startswith("Gui") and isinstance(message.get("props"), dict):

@@ -29,10 +29,12 @@ from services.recording.replay import run_replay
 from services.view import run
 from services.view.controls import Controls, why_read_only
 from services.view.door import Door, new_token
+from services.view.figure import Body
 from services.view.scene import Looks
 from services.view.site import is_news, open_site
 from services.wire.member import Member
 
+ARM = Path(__file__).parents[2] / "simulators/assets/musashi_arm/musashi_arm.urdf"
 BUTTONS = {"Engage", "Disengage", "Reset", "Stop", "EMERGENCY STOP", "Record this posture", "Take over and hold"}
 
 
@@ -53,9 +55,9 @@ def free_port() -> int:
 class Viewing:
     """`gemuco view` in a thread."""
 
-    def __init__(self, robot: str, connect: tuple[str, ...] = ()) -> None:
+    def __init__(self, robot: str, connect: tuple[str, ...] = (), urdf: Path | None = None) -> None:
         self.port, self._stop = free_port(), threading.Event()
-        arguments = (robot, "127.0.0.1", self.port, connect, Looks(), self._stop)
+        arguments = (robot, "127.0.0.1", self.port, connect, Looks(urdf), self._stop)
         self._thread = threading.Thread(target=run.view, args=arguments, daemon=True)
 
     def __enter__(self) -> "Viewing":
@@ -97,6 +99,27 @@ def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
         talking.start("hal")
         talking.start("model")
         browser.until(lambda b: "Healthy" in b.text())
+
+
+def test_the_camera_sees_the_robot_beside_the_panels_until_it_is_moved(robot: str):
+    """A browser reports its whole window first, and the picture beside the panels when they are laid out."""
+
+    def distance(position: tuple[float, ...]) -> float:
+        return sum((a - b) ** 2 for a, b in zip(position, center, strict=True)) ** 0.5
+
+    center = Body(ARM).room()[0]
+    with Viewing(robot, urdf=ARM) as page, Browser(page.port, token=TOKEN) as browser:
+        browser.until(lambda b: len(b.camera) >= 2)  # one for all browsers, and one for the shape of this one
+        wide = distance(browser.camera[-1])
+        browser.look(442, 800)
+        browser.until(lambda b: distance(b.camera[-1]) > 1.5 * wide)
+        browser.look(800, 800)
+        browser.until(lambda b: distance(b.camera[-1]) < 1.01 * wide)
+        browser.look(800, 800, (3.0, 0.0, 0.0))
+        count = len(browser.camera)
+        browser.look(442, 800, (3.0, 0.0, 0.0))
+        time.sleep(0.5)
+        assert len(browser.camera) == count
 
 
 def test_buttons_ask_the_robot(talking: TalkingRobot):
