@@ -57,7 +57,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
     """
     console = Console()
     started, picture = time.monotonic(), out / "story.png"
-    target = control_of(robot).target
+    control_of(robot)  # refuses a robot without a story before anything is made
     check_start(robot, with_page)
     with contextlib.ExitStack() as stack:
         link = ""
@@ -68,7 +68,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
         with progress("compiling") as show:  # otherwise each process would wait for it
             warm(show, has_p=trainer.has_p(robot))
         with Supervisor(out, at_checks=True) as supervisor:
-            with running(robot, path, seed, target, out, supervisor, console) as cast:
+            with running(robot, path, seed, out, supervisor, console, with_page) as cast:
                 perform(cast, seed, picture, list(supervisor.children), link)
             supervisor.stop("client", "recorder")
             cast.remote.print_new()
@@ -104,10 +104,11 @@ class Cast:
 
 @contextmanager
 def running(
-    robot: RobotConfig, path: Path, seed: int, target: str, out: Path, supervisor: Supervisor, console: Console
+    robot: RobotConfig, path: Path, seed: int, out: Path, supervisor: Supervisor, console: Console, with_page: bool
 ) -> Iterator[Cast]:
     """Start the processes at a rate for this machine; if it is not kept, restart them at half of it."""
-    tried = pace.rates_to_try(robot.rates)
+    target = control_of(robot).target
+    tried = pace.rates_to_try(robot.rates, with_page)
     if tried[0] != robot.rates:
         console.print(
             f"This machine has few processor cores ({cores()}), so the story is played at {tried[0].hal:g} Hz, not at "

@@ -22,9 +22,10 @@ MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
 tolerate a few missed cycles; a machine that is fast enough misses none."""
 HALVINGS = 2
 """The rate is halved at most this often: commands need at least a quarter of 200 Hz."""
-FEW_CORES, CALM_RATE = 2, 100.0
-"""With at most this number of processor cores the story begins with at most this rate [Hz]: at 200 Hz the muscle-driven
-arm takes 1.7 cores, so that every stall of the machine would stop the robot."""
+FEW_CORES, CALM_RATE, RATE_WITH_PAGE = 2, 100.0, 50.0
+"""With at most this number of processor cores the story begins with at most these rates [Hz], without and with a page:
+at 200 Hz the muscle-driven arm takes 1.7 cores, so that every stall of the machine would stop the robot. A browser that
+draws the page without a graphics card takes most of a core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +96,14 @@ def _newest(client: Client) -> Status:
     return status
 
 
-def rates_to_try(rates: RatesConfig) -> list[RatesConfig]:
+def rates_to_try(rates: RatesConfig, with_page: bool) -> list[RatesConfig]:
     """Return the rates of the robot file, their halves and quarters; on a machine of few cores without fast ones."""
+    calm = RATE_WITH_PAGE if with_page else CALM_RATE
     tried = [rates]
     for _ in range(HALVINGS):
         tried.append(halved(tried[-1]))
     if cores() <= FEW_CORES:
-        return [slower for slower in tried if slower.hal <= CALM_RATE] or tried[-1:]
+        return [slower for slower in tried if slower.hal <= calm] or tried[-1:]
     return tried
 
 

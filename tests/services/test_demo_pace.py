@@ -77,21 +77,22 @@ def test_half_the_rate_is_half_of_all_that_follows_the_cycle(arm: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cores", "rate", "tried"),
+    ("cores", "with_page", "rate", "tried"),
     [
-        (2, 200, [100, 50]),
-        (2, 100, [100, 50, 25]),
-        (2, 1000, [250]),
-        (4, 1000, [1000, 500, 250]),
-        (3, 50, [50, 25, 12.5]),
+        (2, False, 200, [100, 50]),
+        (2, False, 100, [100, 50, 25]),
+        (2, False, 1000, [250]),
+        (2, True, 200, [50]),
+        (4, True, 1000, [1000, 500, 250]),
+        (3, False, 50, [50, 25, 12.5]),
     ],
 )
 def test_few_cores_try_no_fast_rates(
-    monkeypatch: pytest.MonkeyPatch, arm: Path, cores: int, rate: float, tried: list[float]
+    monkeypatch: pytest.MonkeyPatch, arm: Path, cores: int, with_page: bool, rate: float, tried: list[float]
 ) -> None:
     monkeypatch.setattr(pace, "cores", lambda: cores)
     rates = load_robot(arm).rates.model_copy(update={"hal": rate})
-    assert [slower.hal for slower in pace.rates_to_try(rates)] == tried
+    assert [slower.hal for slower in pace.rates_to_try(rates, with_page)] == tried
 
 
 def test_the_same_robot_at_another_rate_needs_no_other_model(arm: Path) -> None:
@@ -172,7 +173,7 @@ def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
 ) -> None:
     processes, console = Processes(monkeypatch, highest, cores), Console(record=True, width=300)
     robot = load_robot(arm)
-    with demo.running(robot, arm, 1, "joint_position", arm.parent, processes, console) as cast:  # type: ignore[arg-type]
+    with demo.running(robot, arm, 1, arm.parent, processes, console, False) as cast:  # type: ignore[arg-type]
         assert cast.robot.rates.hal == rates[-1]
         assert processes.stopped == len(rates) - 1
     assert processes.rates == rates
@@ -194,7 +195,7 @@ def test_a_process_that_ended_is_named_before_what_it_did_not_answer(
     monkeypatch.setattr(processes, "check", check)
     with (
         pytest.raises(ChildDied if has_ended else ServiceUnavailable),
-        demo.running(load_robot(arm), arm, 1, "joint_position", arm.parent, processes, Console()),  # type: ignore[arg-type]
+        demo.running(load_robot(arm), arm, 1, arm.parent, processes, Console(), False),  # type: ignore[arg-type]
     ):
         raise ServiceUnavailable("No 'vision' service answered.")
 
