@@ -104,7 +104,7 @@ class Shift(NamedTuple):
 def changes(rows: np.ndarray, signals: np.ndarray) -> np.ndarray:
     """Return how far all elements of each signal move within `TIMING`, shape (signals, columns).
 
-    The largest step from one sample to the next does not count: a value that jumps does not excuse itself.
+    The largest step from one sample to the next counts as the second largest: a jump does not excuse itself.
 
     Args:
         rows: Successive samples of one block, from the last one of the block before on, shape (samples, columns).
@@ -114,6 +114,6 @@ def changes(rows: np.ndarray, signals: np.ndarray) -> np.ndarray:
     steps = np.nan_to_num(np.diff(rows, axis=0))
     if len(steps) < 2:
         return np.zeros(owns.shape)
-    largest = np.take_along_axis(steps, np.abs(steps).argmax(axis=0)[None], axis=0)[0]
-    velocity = (steps.sum(axis=0) - largest) / ((len(steps) - 1) / len(steps) * BLOCK)
+    second = np.sort(np.abs(steps), axis=0)[-2]
+    velocity = np.clip(steps, -second, second).sum(axis=0) / BLOCK
     return np.asarray(owns * velocity * TIMING)

@@ -48,10 +48,14 @@ class Bench:
 
     def __init__(self, tool: JudgedTool, relations: Relations, config: TrustConfig) -> None:
         """Begin without blocks, for a model whose normal errors are known."""
-        schema, size = tool.schema, len(relations.columns)
+        schema, size, signals = (
+            tool.schema,
+            len(relations.columns),
+            len(np.unique(relations.signals[: relations.count])),
+        )
         assert schema.normal is not None
         self.tool, self.relations, self._config = tool, relations, config
-        self.recent, self.healthy, self.lasting = Recent(), Healthy(size), LastingTest(size)
+        self.recent, self.healthy, self.lasting = Recent(signals), Healthy(size, signals), LastingTest(size)
         self.view: View | None = None
         self.lied_when_settled = False
         self._outside: deque[bool] = deque(maxlen=LONGEST)
@@ -65,7 +69,7 @@ class Bench:
     def refresh(self) -> None:
         """Let the limits follow the healthy errors."""
         self.judge = Judge(self.healthy, self._config.false_alarms, self._least)
-        self.recent.lateness = self.healthy.lateness
+        self.recent.lag, self.recent.apart = self.healthy.lag, self.healthy.apart
 
     @property
     def schema(self) -> BodySchema:
@@ -197,5 +201,6 @@ class Bench:
         noise, z, hidden = view.noises[-1].copy(), view.z.copy(), list(view.hidden)
         z[:, hidden], noise[hidden] = np.nan, np.nan
         self.recent.jumps.learn(view.hidden)
+        late = None if self._outside[-1] else view.late  # errors of a model out there are of any sign
         if np.isfinite(z[-1]).any():
-            self.healthy.add(z, evidence.step, noise, motion, view.timing[-1] / self.recent.lateness)
+            self.healthy.add(z, evidence.step, noise, motion, late, self.recent.lag)

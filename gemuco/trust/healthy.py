@@ -35,8 +35,10 @@ what was learned too, for a while."""
 NOISE_KNOWN = 20
 """The usual noise of a column is known after this number of blocks in which it was measured."""
 LATE, SEEN, LATENESS = 0.4, 30.0, (0.05, 4.0)
-"""Values of two signals are assumed to be apart by the first multiple of `TIMING`, which counts as the second number of
-blocks. The multiple is at least and at most the third pair."""
+"""Values of two signals are assumed to be apart by the first multiple of `TIMING`, without a usual lag, which counts as
+the second number of blocks. The multiple is at least and at most the third pair, as a lag is at most."""
+VARIES = 0.25
+"""Values are apart by this share of their lag besides: delays vary, and a velocity changes within a block."""
 CLEAR = 9.0
 """The square of one error counts as at most this multiple of its expected one."""
 RESTS = 0.2
@@ -46,7 +48,7 @@ RESTS = 0.2
 class Healthy:
     """Running statistics of standardised errors, by judged column."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, signals: int = 1) -> None:
         self.count, self.moved = 0, 0.0
         self.caution = 0.0
         """An element that gives no sign of its own is hidden from this sum of squared shares of an alarm on."""
@@ -56,11 +58,19 @@ class Healthy:
         self._pace = LEAST_PACE
         self._late = np.array([LATE**2, 1.0]) * SEEN
         """Weighted sums of the squares of the errors' parts by timing, and of the squares that `TIMING` would cause."""
+        self._lags, self._agreement = np.zeros((signals, signals)), np.zeros(signals)
+        """Weighted sums of the products of the errors by timing of two signals, and of these with the errors."""
         self._noise, self._noise_count = np.full((2, size), 1e-6), np.zeros((2, size))
         """This is the noise at rest and in motion: values of a fast motion do not fit each other as well."""
 
     def add(
-        self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float, timing: np.ndarray | None = None
+        self,
+        z: np.ndarray,
+        steps: np.ndarray,
+        noise: np.ndarray,
+        motion: float,
+        late: np.ndarray | None = None,
+        lag: np.ndarray | None = None,
     ) -> None:
         """Learn from one block; columns whose newest error is NaN keep what they have.
 
@@ -69,7 +79,9 @@ class Healthy:
             steps: Result of the step test, shape (n,).
             noise: Variance of the noise within the block, in the same units, shape (n,); NaN where unknown.
             motion: Result of `motion`; a body at rest shows the same errors again and again.
-            timing: Errors of values that are apart by `TIMING`, in the unit of `z`, shape (n,); by default none.
+            late: Errors of the newest block if one signal is late by `-TIMING`, in the unit of `z`, shape (signals, n);
+                by default not known.
+            lag: The multiple of these that was taken off, shape (signals,).
         """
         self.count += 1
         self.moved += motion
@@ -78,12 +90,12 @@ class Healthy:
         share = doubted * motion / min(PRIOR + self.moved, MEMORY)
         now = z[-1]
         is_new = np.isfinite(now)
-        if timing is not None:
-            self._learn_lateness(now, timing)
+        if late is not None and lag is not None:
+            self._learn_lateness(now, late, lag)
         square = np.clip(np.where(is_new, now**2, self._square), 0.0, CLEAR * self._square)
         self._square += share * (square - self._square)
-        for lag, name in ((1, "_near"), (APART, "_far")):
-            mean, product = getattr(self, name), now * z[-1 - lag] / self._square
+        for apart, name in ((1, "_near"), (APART, "_far")):
+            mean, product = getattr(self, name), now * z[-1 - apart] / self._square
             product = np.where(np.isfinite(product), np.clip(product, -4.0, 4.0), mean)
             setattr(self, name, mean + share * (product - mean))
         above, fade = is_new & (steps > COMMON), 1.0 - 1.0 / TAIL_MEMORY
@@ -96,20 +108,28 @@ class Healthy:
         change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
         self._noise += share * (change - self._noise)
 
-    def _learn_lateness(self, now: np.ndarray, timing: np.ndarray) -> None:
-        """Learn how far values are apart in time.
+    def _learn_lateness(self, now: np.ndarray, late: np.ndarray, lag: np.ndarray) -> None:
+        """Learn how late each signal usually is, and how far values are apart in time beyond it; see `add`.
 
         Args:
             now: The newest errors, shape (n,); NaN where missing.
-            timing: Errors of values that are apart by `TIMING`, shape (n,).
+            late: Errors if one signal is late by `-TIMING`, shape (signals, n).
+            lag: The multiple of these that was taken off, shape (signals,).
         """
-        square = self.scale**2
-        whole, known = square + (self.lateness * timing) ** 2, np.isfinite(now * timing)
-        weight = np.where(known, (timing / whole) ** 2, 0.0)
-        beyond = np.where(known, np.clip(now**2, 0.0, CLEAR * whole) - square, 0.0)
-        sums = np.array([(weight * beyond).sum(), (weight * np.nan_to_num(timing) ** 2).sum()])
+        square, timing = self.scale**2, (late**2).sum(axis=0)
+        whole, known = square + (late * (self.apart @ late)).sum(axis=0), np.isfinite(now * timing)
+        error = np.where(known, np.clip(now, -np.sqrt(CLEAR * whole), np.sqrt(CLEAR * whole)), 0.0)
+        weight, beyond = np.where(known, timing / whole**2, 0.0), error**2 - whole + self.lateness**2 * timing
+        sums = np.array([(weight * np.nan_to_num(beyond)).sum(), (weight * np.nan_to_num(timing)).sum()])
         sums /= max(1.0, sums[1])  # a block counts once, not once for each of its columns
         self._late += sums - self._late * sums[1] / MEMORY
+        late = np.where(known, late, 0.0) / np.where(known, np.sqrt(whole), 1.0)
+        error = error / np.where(known, np.sqrt(whole), 1.0)
+        products = late @ late.T
+        share = 1.0 / max(1.0, np.trace(products))
+        fade = 1.0 - share * np.trace(products) / MEMORY
+        self._lags = fade * self._lags + share * products
+        self._agreement = fade * self._agreement + share * (late @ error + products @ lag)
 
     def excuse(self, columns: list[int], steps: np.ndarray, was_hidden: bool) -> None:
         """Learn that an alarm was none, because it ended by itself.
@@ -144,8 +164,23 @@ class Healthy:
         return np.clip(np.sqrt(self._square), *SCALES)
 
     @property
+    def lag(self) -> np.ndarray:
+        """Multiple of `-TIMING` by which each signal is usually late beside the others, shape (signals,)."""
+        return np.clip(self._doubt @ self._agreement, -LATENESS[1], LATENESS[1])
+
+    @property
+    def apart(self) -> np.ndarray:
+        """Covariance of the times of the signals beyond their lag [squares of `TIMING`], shape (signals, signals)."""
+        return np.diag(self.lateness**2 + (VARIES * self.lag) ** 2) + LATE**2 * SEEN * self._doubt
+
+    @property
+    def _doubt(self) -> np.ndarray:
+        """Inverse of how well the lags are known, shape (signals, signals)."""
+        return np.linalg.inv(self._lags + SEEN * np.eye(len(self._lags)))
+
+    @property
     def lateness(self) -> float:
-        """Standard deviation of the time between values that count as of one time, as a multiple of `TIMING`."""
+        """Standard deviation of the time between values beyond their usual lag, as a multiple of `TIMING`."""
         return float(np.clip(np.sqrt(max(self._late[0], 0.0) / self._late[1]), *LATENESS))
 
     @property

@@ -38,6 +38,7 @@ class View:
         z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
         healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
         timing: Errors of values that are not quite of one time, in the unit of `z`, shape (LONGEST, n).
+        late: Errors of the newest block if one signal is late by `-TIMING`, in the same unit, shape (signals, n).
         noises: Variance of the noise within each of the `NOISY` newest blocks [squared errors of a healthy body], shape
             (blocks, n); NaN where unknown.
         hidden: The hidden columns.
@@ -51,6 +52,7 @@ class View:
     z: np.ndarray
     healthy: np.ndarray
     timing: np.ndarray
+    late: np.ndarray
     noises: np.ndarray
     hidden: Hidden
     settled: np.ndarray
@@ -89,10 +91,8 @@ class View:
 
     def scaled(self, usual: np.ndarray) -> "View":
         """Return the same errors, if these multiples of a healthy body's errors are usual, shape (n,)."""
-        timing = self.timing / usual
-        return replace(
-            self, z=self.z / usual, healthy=self.healthy * usual, timing=timing, settled=self.settled / usual
-        )
+        z, timing, late, settled = (part / usual for part in (self.z, self.timing, self.late, self.settled))
+        return replace(self, z=z, healthy=self.healthy * usual, timing=timing, late=late, settled=settled)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,21 +118,22 @@ class _Errors(NamedTuple):
         newest: Number of the newest of them.
         errors: Errors [standard deviations of the signal], shape (blocks, columns).
         healthy: Those of a healthy body, shape (blocks, columns).
-        timing: Those of values that are apart by `TIMING`, shape (blocks, columns).
+        late: Those of each signal if it is late by `-TIMING`, shape (blocks, signals, columns).
         noises: As in `View`.
     """
 
     newest: int
     errors: np.ndarray
     healthy: np.ndarray
-    timing: np.ndarray
+    late: np.ndarray
     noises: np.ndarray
 
 
 class Recent:
     """The newest blocks."""
 
-    def __init__(self) -> None:
+    def __init__(self, signals: int) -> None:
+        """Begin without blocks, for this number of signals, whose values are of one time."""
         self.blocks: deque[_Block] = deque(maxlen=LONGEST)
         self._count = 0
         self._errors: dict[Hidden, _Errors] = {}
@@ -148,8 +149,8 @@ class Recent:
         self.jumps, self.repeats = Jumps(), Repeats()
         self.usual: dict[Hidden, np.ndarray] = {}
         """Multiples of a healthy body's errors that are usual while these columns are hidden, shape (columns,)."""
-        self.lateness = 0.0
-        """Values of two signals are apart by this multiple of `TIMING`."""
+        self.lag, self.apart = np.zeros(signals), np.zeros((signals, signals))
+        """Multiple of `-TIMING` by which each signal is usually late, and covariance of their times beyond it."""
         self.resting = 0
         """This number of blocks ago the body had settled at its posture; 0 in motion."""
 
@@ -219,8 +220,8 @@ class Recent:
 
     def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
         """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
-        other = Recent()
-        other._moved, other._schema, other.lateness = self._moved.copy(), schema, self.lateness
+        other = Recent(len(self.lag))
+        other._moved, other._schema, other.lag, other.apart = self._moved.copy(), schema, self.lag, self.apart
         full = relations.rows(schema, values)
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))
@@ -256,7 +257,8 @@ class Recent:
         used[list(hidden)] = False
         known, missing = self._errors_without(relations, hidden), np.array([block.missing for block in self.blocks])
         healthy = known.healthy * self.usual.get(hidden, 1.0)
-        z, timing = known.errors / healthy, self.lateness * known.timing / healthy
+        z = (known.errors - np.einsum("s,bsn->bn", self.lag, known.late)) / healthy
+        timing = np.sqrt(np.maximum((known.late * (self.apart @ known.late)).sum(axis=1), 0.0)) / healthy
         z[np.any(missing & used, axis=1)] = np.nan
         z[missing] = np.nan
         if len(z) < LONGEST:
@@ -264,7 +266,10 @@ class Recent:
             z, healthy, timing = (np.concatenate([lacking, part]) for part in (z, healthy, timing))
         settled, moved = self._errors_when_settled(relations, hidden, used), np.array(self._moved) - self._moved[-1]
         settled = np.where(self._away < 1.0, settled, np.nan)
-        return View(z, healthy, timing, known.noises, hidden, settled, self._away, moved, len(self.blocks[-1].each))
+        return View(
+            z, healthy, timing, known.late[-1] / healthy[-1], known.noises, hidden, settled, self._away, moved,
+            len(self.blocks[-1].each),
+        )  # fmt: skip
 
     def _errors_without(self, relations: Relations, hidden: Hidden) -> _Errors:
         """Return the errors with some columns hidden; only those of blocks that are new are computed."""
@@ -292,7 +297,7 @@ class Recent:
         judged = relations.judged(self._schema, hidden, features, sensed, means, shift)
         relation, newest = relations.without(hidden), blocks[-NOISY:]
         noises = np.array([_noise(block.each, relation.maps) for block in newest])
-        return judged.errors, judged.healthy, judged.timing, noises / relation.healthy(features[-NOISY:]) ** 2
+        return judged.errors, judged.healthy, judged.late, noises / relation.healthy(features[-NOISY:]) ** 2
 
     def find_repeats(self, view: View, scale: np.ndarray, motion: float) -> None:
         """Find the elements that are stuck after the newest block.

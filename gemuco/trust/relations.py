@@ -92,19 +92,19 @@ class Relation:
 
 
 class Judged(NamedTuple):
-    """Errors of samples with some columns hidden, arrays of shape (n, columns) [standard deviations of the signal].
+    """Errors of samples with some columns hidden [standard deviations of the signal].
 
     Attributes:
-        errors: The errors.
-        healthy: Those of a healthy body whose values are of one time.
-        size: Its multiple of the usual one, larger where a value follows less from the others.
-        timing: Errors of values of two signals that are apart by `TIMING`.
+        errors: The errors, shape (n, columns).
+        healthy: Those of a healthy body whose values are of one time, shape (n, columns).
+        size: Its multiple of the usual one, larger where a value follows less from the others, shape (n, columns).
+        late: Change of the errors if all elements of one signal are changed by `shift`, shape (n, signals, columns).
     """
 
     errors: np.ndarray
     healthy: np.ndarray
     size: np.ndarray
-    timing: np.ndarray
+    late: np.ndarray
 
 
 class Relations:
@@ -277,7 +277,7 @@ class Relations:
         errors, healthy = relation.errors(features), relation.healthy(features)
         growth, size = healthy / relation.std, relation.by_watch(values)
         healthy = np.maximum(healthy * size, self._least)
-        timing = np.zeros((len(values), 1, len(self.columns))) if shift is None else shift.features @ relation.maps
+        late = np.zeros((len(values), 1, len(self.columns))) if shift is None else shift.features @ relation.maps
         if relation.network.any():
             sensed, off = self._sensed_without(schema, hidden, errors, sensed, values)
             lies, spread = self.sensitivity.lies(sensed, hidden)
@@ -291,8 +291,8 @@ class Relations:
             size = np.where(better, by_network, size)
             if shift is not None and shift.values.any():
                 own = self.sensitivity.moved(sensed, hidden, shift.values)
-                timing = np.where(better[:, None], own, timing)
-        return Judged(errors, healthy, size, np.sqrt((timing**2).sum(axis=1)))
+                late = np.where(better[:, None], own, late)
+        return Judged(errors, healthy, size, late)
 
     def outside(self, schema: BodySchema, values: np.ndarray, *errors: np.ndarray) -> np.ndarray:
         """Return how much larger the network's errors are at samples outside of the learned ranges, shape (n, 1).

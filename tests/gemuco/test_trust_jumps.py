@@ -149,6 +149,7 @@ def test_errors_that_were_large_before_a_change_are_usual() -> None:
         np.ones_like(z),
         np.zeros_like(z),
         np.zeros((1, SIZE)),
+        np.zeros((1, SIZE)),
         frozenset(),
         none,
         np.zeros(SIZE),

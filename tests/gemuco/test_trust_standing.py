@@ -79,7 +79,8 @@ def test_lies_are_found_where_a_value_follows_from_the_others(model, element, li
 
 
 def test_at_standstill_one_value_that_moves_accuses_no_other(model):
-    relations, recent = Relations.of(model), Recent()
+    relations = Relations.of(model)
+    recent = Recent(len(np.unique(relations.signals[: relations.count])))
     rest = np.tile(model.scaler.normalise(np.array([0.0, 0.0, 0.0, 0.05])), (SAMPLES, 1))
     for block in range(SETTLING + 10):
         rest[:, STEERING] += 0.2 * (block >= SETTLING)
@@ -92,7 +93,7 @@ def test_at_standstill_one_value_that_moves_accuses_no_other(model):
     usual = relations.without(frozenset())
     even = replace(usual, by_watch=usual.by_watch.even(4), by_network=usual.by_network.even(4))
     relations._kept[frozenset()] = even
-    again = Recent()
+    again = Recent(len(recent.lag))
     again.__dict__.update(recent.__dict__, _errors={})
     assert np.isfinite(again.view(relations, frozenset()).settled[STEERING])
 

@@ -119,7 +119,7 @@ def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     judge = Judge(healthy, 0.006, np.full(2, size))
     noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
     unknown, none = np.full(2, np.nan), np.zeros((LONGEST, 2))
-    evidence = judge(View(none, none + 1.0, none, noises, frozenset(), unknown, np.zeros(2), MOVING, 20))
+    evidence = judge(View(none, none + 1.0, none, none[:1], noises, frozenset(), unknown, np.zeros(2), MOVING, 20))
     assert evidence.is_noise.tolist() == [is_noise, False]
     assert (evidence.ratio[0] >= 1.0) == is_noise
 
