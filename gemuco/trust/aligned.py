@@ -85,7 +85,7 @@ class Aligned:
 
 
 class Shift(NamedTuple):
-    """Changes of blocks if all elements of one signal are late by `TIMING`, for every signal.
+    """Changes of blocks if all elements of one signal were measured `TIMING` later, for every signal.
 
     Attributes:
         values: Changes of every column [standard deviations], shape (n, signals, columns).

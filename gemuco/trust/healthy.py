@@ -59,7 +59,7 @@ class Healthy:
         self._late = np.array([LATE**2, 1.0]) * SEEN
         """Weighted sums of the squares of the errors' parts by timing, and of the squares that `TIMING` would cause."""
         self._lags, self._agreement = np.zeros((signals, signals)), np.zeros(signals)
-        """Weighted sums of the products of the errors by timing of two signals, and of these with the errors."""
+        """Weighted sums of the products of two signals' changes of the errors, and of these changes with the errors."""
         self._noise, self._noise_count = np.full((2, size), 1e-6), np.zeros((2, size))
         """This is the noise at rest and in motion: values of a fast motion do not fit each other as well."""
 
@@ -79,9 +79,9 @@ class Healthy:
             steps: Result of the step test, shape (n,).
             noise: Variance of the noise within the block, in the same units, shape (n,); NaN where unknown.
             motion: Result of `motion`; a body at rest shows the same errors again and again.
-            late: Errors of the newest block if one signal is late by `-TIMING`, in the unit of `z`, shape (signals, n);
-                by default not known.
-            lag: The multiple of these that was taken off, shape (signals,).
+            late: Changes of the newest errors if one signal is measured `TIMING` later, in the unit of `z`, shape
+                (signals, n); not known by default.
+            lag: The multiple of these that was taken off the errors, shape (signals,).
         """
         self.count += 1
         self.moved += motion
@@ -113,8 +113,8 @@ class Healthy:
 
         Args:
             now: The newest errors, shape (n,); NaN where missing.
-            late: Errors if one signal is late by `-TIMING`, shape (signals, n).
-            lag: The multiple of these that was taken off, shape (signals,).
+            late: Changes of these if one signal is measured `TIMING` later, shape (signals, n).
+            lag: The multiple of the changes that was taken off the errors, shape (signals,).
         """
         square, timing = self.scale**2, (late**2).sum(axis=0)
         whole, known = square + (late * (self.apart @ late)).sum(axis=0), np.isfinite(now * timing)

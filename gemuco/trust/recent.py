@@ -38,7 +38,7 @@ class View:
         z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
         healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
         timing: Errors of values that are not quite of one time, in the unit of `z`, shape (LONGEST, n).
-        late: Errors of the newest block if one signal is late by `-TIMING`, in the same unit, shape (signals, n).
+        late: Changes of the newest errors if one signal is measured `TIMING` later, same unit, shape (signals, n).
         noises: Variance of the noise within each of the `NOISY` newest blocks [squared errors of a healthy body], shape
             (blocks, n); NaN where unknown.
         hidden: The hidden columns.
@@ -99,7 +99,7 @@ class View:
 class _Block:
     """Samples of one block: mean, features of mean and samples, range and absence of every column, network errors.
 
-    `shift` says what is different in it if a signal is late.
+    `shift` says what is different in it if a signal is measured later.
     """
 
     mean: np.ndarray
@@ -118,7 +118,7 @@ class _Errors(NamedTuple):
         newest: Number of the newest of them.
         errors: Errors [standard deviations of the signal], shape (blocks, columns).
         healthy: Those of a healthy body, shape (blocks, columns).
-        late: Those of each signal if it is late by `-TIMING`, shape (blocks, signals, columns).
+        late: Their changes if one signal is measured `TIMING` later, shape (blocks, signals, columns).
         noises: As in `View`.
     """
 

@@ -271,7 +271,7 @@ class Relations:
             features: Features of the samples, shape (n, features).
             sensed: Errors of the network at the samples.
             values: Values of the judged columns, p included [standard deviations], shape (n, columns).
-            shift: What is different in the samples if a signal is late; by default nothing is, as at rest.
+            shift: What is different in them if a signal is measured later; by default nothing is, as at rest.
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
