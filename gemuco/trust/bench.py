@@ -48,11 +48,8 @@ class Bench:
 
     def __init__(self, tool: JudgedTool, relations: Relations, config: TrustConfig) -> None:
         """Begin without blocks, for a model whose normal errors are known."""
-        schema, size, signals = (
-            tool.schema,
-            len(relations.columns),
-            len(np.unique(relations.signals[: relations.count])),
-        )
+        schema, size = tool.schema, len(relations.columns)
+        signals = len(np.unique(relations.signals[: relations.count]))
         assert schema.normal is not None
         self.tool, self.relations, self._config = tool, relations, config
         self.recent, self.healthy, self.lasting = Recent(signals), Healthy(size, signals), LastingTest(size)

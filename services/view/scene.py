@@ -201,24 +201,26 @@ class Scene:
         A browser first reports the shape of the whole window, and later that of the picture beside the panels.
         """
         camera = client.camera
-        top = TOP if camera.aspect < PHONE else 1.0
-        fitted = np.zeros(3)
-        shape = 0.0
+        fitted, shape, top = np.zeros(3), 0.0, 0.0
+        is_there = False
+        """Whether the browser has reported the camera at `fitted`; reports from before it was put there are no move."""
 
-        def fit() -> None:
-            nonlocal fitted, shape
-            shape = camera.aspect
+        def fit(_: "viser.CameraHandle") -> None:
+            nonlocal fitted, shape, top, is_there
+            if not (camera.image_width and camera.image_height):
+                return  # a window that is minimised
+            is_near = bool(np.linalg.norm(camera.position - fitted) < MOVED * self._radius)
+            if camera.aspect == shape or (is_there and not is_near):
+                is_there |= is_near
+                return
+            top = top or (TOP if camera.aspect < PHONE else 1.0)
+            shape, is_there = camera.aspect, False
             fitted, target = self.fit(shape, camera.fov, top)
             with client.atomic():
                 camera.position, camera.look_at = fitted, target
 
-        def refit(_: "viser.CameraHandle") -> None:
-            is_moved = np.linalg.norm(camera.position - fitted) > MOVED * self._radius
-            if camera.aspect != shape and not is_moved:
-                fit()
-
-        fit()
-        camera.on_update(refit)
+        fit(camera)
+        camera.on_update(fit)
 
 
 def _sensed(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> dict[str, float]:

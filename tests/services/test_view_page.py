@@ -111,10 +111,12 @@ def test_the_camera_sees_the_robot_beside_the_panels_until_it_is_moved(robot: st
     with Viewing(robot, urdf=ARM) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: len(b.camera) >= 2)  # one for all browsers, and one for the shape of this one
         wide = distance(browser.camera[-1])
-        browser.look(442, 800)
+        browser.look(442, 800, (1.0, 1.0, 1.0))  # on its way before the browser got the first place
         browser.until(lambda b: distance(b.camera[-1]) > 1.5 * wide)
+        browser.look(0, 0)  # minimised
         browser.look(800, 800)
         browser.until(lambda b: distance(b.camera[-1]) < 1.01 * wide)
+        browser.look(800, 800)
         browser.look(800, 800, (3.0, 0.0, 0.0))
         count = len(browser.camera)
         browser.look(442, 800, (3.0, 0.0, 0.0))
