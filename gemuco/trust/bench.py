@@ -84,6 +84,11 @@ class Bench:
         """Whether what is healthy was learned with the tool or load in use."""
         return self._is_known(self.schema)
 
+    @property
+    def beyond(self) -> Hidden:
+        """Columns whose newest values are outside of what was learned."""
+        return self.relations.beyond(self.schema, self.recent.values()[-1])
+
     def was_outside(self, age: int) -> bool:
         """Whether the body was outside of what was learned shortly before the newest `age` blocks."""
         before = list(self._outside)[: max(len(self._outside) - age, 1)]

@@ -116,27 +116,39 @@ class Case:
         is_body = self.may_be_body and not any(self.cause.columns | columns <= part for part in parts)
         return is_body or self.cause.cause == "environment"
 
-    def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden], beyond: Hidden) -> bool:
-        """Whether another element replaces it: one of those that look alike, or one with much more evidence.
+    def is_bound(self, again: Cause, parts: Iterable[Hidden], beyond: Hidden) -> bool:
+        """Whether an element of another part of the body must not replace it.
 
-        It is held against all sensors of its part of the body. If one of these jumped, or is beyond what was learned,
-        or all are contradicted, another part does not replace it: a cut wire lets the arm go where its neighbours look
-        wrong.
+        So it is if one of the sensors of its part jumped, or is beyond what was learned, or all are contradicted: a cut
+        wire lets the arm go where its neighbours look wrong.
 
         Args:
             again: The element that explains best what is seen now.
-            evidence: The evidence now.
             parts: Columns of each part of the body with several sensors.
             beyond: Columns outside of what was learned.
         """
+        whole = self._whole(parts)
+        return not again.columns <= whole and (self.is_plain or self.may_be_body or bool(whole & beyond))
+
+    def _whole(self, parts: Iterable[Hidden]) -> Hidden:
+        """Return all columns of its part of the body."""
         columns = self.cause.columns
-        whole = columns.union(*(part for part in parts if columns <= part))
-        if again.columns == columns:
+        return columns.union(*(part for part in parts if columns <= part))
+
+    def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden]) -> bool:
+        """Whether another element replaces it: one of those that look alike, or one with much more evidence.
+
+        It is held against all sensors of its part of the body.
+
+        Args:
+            again: The element that explains best what is seen now; the case must not be bound.
+            evidence: The evidence now.
+            parts: Columns of each part of the body with several sensors.
+        """
+        if again.columns == self.cause.columns:
             return False
-        if not again.columns <= whole and (self.is_plain or self.may_be_body or whole & beyond):
-            return False
-        own = float(evidence.strength[list(whole - again.columns)].max())
-        return float(evidence.strength[again.lead]) > (1.0 if again.columns < columns else SURE) * own
+        own = float(evidence.strength[list(self._whole(parts) - again.columns)].max())
+        return float(evidence.strength[again.lead]) > (1.0 if again.columns < self.cause.columns else SURE) * own
 
     def finding(self, elements: Sequence[int], since: float) -> Finding:
         """Return what others see of it: positions of its elements in the layout, wrong since this time [s]."""

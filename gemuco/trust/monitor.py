@@ -265,7 +265,9 @@ class TrustMonitor:
         elements, others = self._at(replace(case, cause=cause)), self.hidden - self._at(case)
         is_sensor = not cause.columns & self._bench.environment
         is_used = cause.cause == "either" and self._config.pairs == "use"
-        return is_sensor and not is_used and not self._immune & elements and self._replaces(others | elements)
+        if is_used or not is_sensor or case.is_bound(cause, self._parts, self._bench.beyond):
+            return False
+        return not self._immune & elements and self._replaces(others | elements)
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -385,11 +387,9 @@ class TrustMonitor:
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "part" and case.cause.columns < again.columns:
             case.cause, case.may_be_body = again, True
-        elif again.cause == "element" and self._may_take(again, case):
-            beyond = bench.relations.beyond(bench.schema, bench.recent.values()[-1])
-            if case.yields_to(again, evidence, self._parts, beyond):
-                case.cause = again
-                self._describe(case, rest | again.columns)
+        elif again.cause == "element" and self._may_take(again, case) and case.yields_to(again, evidence, self._parts):
+            case.cause = again
+            self._describe(case, rest | again.columns)
 
     def _doubt_tool(self, case: Case, evidence: Evidence, rest: Hidden) -> None:
         """Drop another tool as the cause if no p explains all, and an element does with the p so far."""
@@ -424,7 +424,7 @@ class TrustMonitor:
             bench.environment - hidden if is_new else frozenset(),
             lambda: bench.conditions(hidden, age),
             bench.alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
-            bench.relations.beyond(bench.schema, bench.recent.values()[-1]),
+            bench.beyond,
             (bench.sudden(age) | bench.recent.repeats.stuck | bench.moved_alone(age)) - hidden,
             begun,
             self._jumped or frozenset(),

@@ -77,32 +77,41 @@ def test_a_part_of_which_all_sensors_are_contradicted_leaves_the_body_unknown_fo
 
 
 @pytest.mark.parametrize(
-    ("joint", "beyond", "is_plain", "yields"),
+    ("beyond", "is_plain", "may_be_body", "is_bound"),
     [
-        (70.0, (), False, False),
-        (110.0, (), False, True),
-        (110.0, (TENSION,), False, False),
-        (110.0, (LENGTH,), False, False),
-        (110.0, (OTHER,), False, True),
-        (110.0, (), True, False),
+        ((), False, False, False),
+        ((TENSION,), False, False, True),
+        ((LENGTH,), False, False, True),
+        ((OTHER,), False, False, False),
+        ((), True, False, True),
+        ((), False, True, True),
     ],
 )
-def test_a_sensor_of_a_part_yields_to_a_joint_with_much_more_evidence_only(
-    joint: float, beyond: tuple[int, ...], is_plain: bool, yields: bool
+def test_a_part_that_changed_is_not_replaced_by_a_sensor_beside_it(
+    beyond: tuple[int, ...], is_plain: bool, may_be_body: bool, is_bound: bool
 ) -> None:
+    accused = Cause(frozenset({TENSION}), "element", TENSION)
+    case = Case(accused, 1, 1, 1, is_plain=is_plain, may_be_body=may_be_body)
+    joint, own = (Cause(frozenset({column}), "element", column) for column in (JOINT, LENGTH))
+    assert case.is_bound(joint, [MUSCLE], frozenset(beyond)) == is_bound
+    assert not case.is_bound(own, [MUSCLE], frozenset(beyond)), "it is of the same muscle"
+
+
+def test_a_sensor_of_a_part_yields_to_a_joint_with_much_more_evidence_only() -> None:
     """The length has more evidence than the accused tension; both are of the muscle."""
-    case = Case(Cause(frozenset({TENSION}), "element", TENSION), 1, 1, 1, is_plain=is_plain)
-    whole, other = evidence(joint=joint, tension=20.0, length=50.0), Cause(frozenset({JOINT}), "element", JOINT)
-    assert case.yields_to(other, whole, [MUSCLE], frozenset(beyond)) == yields
-    own = Cause(frozenset({LENGTH}), "element", LENGTH)
-    assert case.yields_to(own, whole, [MUSCLE], frozenset(beyond)), "2.5 times its evidence"
-    assert not case.yields_to(case.cause, whole, [MUSCLE], frozenset(beyond))
+    case, joint = Case(Cause(frozenset({TENSION}), "element", TENSION), 1, 1, 1), frozenset({JOINT})
+    for strength, yields in ((70.0, False), (110.0, True)):
+        whole = evidence(joint=strength, tension=20.0, length=50.0)
+        assert case.yields_to(Cause(joint, "element", JOINT), whole, [MUSCLE]) == yields
+        own = Cause(frozenset({LENGTH}), "element", LENGTH)
+        assert case.yields_to(own, whole, [MUSCLE]), "2.5 times its evidence"
+        assert not case.yields_to(case.cause, whole, [MUSCLE])
 
 
 def test_one_of_two_that_look_alike_needs_more_evidence_only() -> None:
     case = Case(Cause(frozenset({JOINT, OTHER}), "either", JOINT), 1, 1, 1)
     alone = Cause(frozenset({JOINT}), "element", JOINT)
-    assert case.yields_to(alone, evidence(joint=10.0), [], frozenset())
+    assert case.yields_to(alone, evidence(joint=10.0), [])
 
 
 @pytest.mark.parametrize(

@@ -88,14 +88,14 @@ def test_a_wrong_suspect_is_shown_again_and_the_right_one_hidden(model, seed):
     assert GRAVITY not in monitor.hidden
 
 
-@pytest.mark.parametrize("rule", ["trusted by hand", "not replaced", "body"])
+@pytest.mark.parametrize("rule", ["trusted by hand", "not replaced", "body", "a part that changed"])
 def test_a_case_is_not_given_to_an_element_that_must_not_be_hidden(model, rule, monkeypatch):
     replaced = {GRAVITY} if rule == "not replaced" else set(range(LAYOUT.size))
     monitor = TrustMonitor(model, replaces=lambda elements: elements <= replaced)
     rows = body(walk(CHANGE + 2, 80), TOOLS["short"])
     for number, block in enumerate(blocks_of(model, rows)):
         monitor.add(block, number * BLOCK)
-    hide(monitor, GRAVITY)
+    hide(monitor, GRAVITY, may_be_body=rule == "a part that changed")
     bench = monitor._bench
     monkeypatch.setattr(monitor, "_describe", lambda *_: None)
     if rule == "trusted by hand":
@@ -109,7 +109,7 @@ def test_a_case_is_not_given_to_an_element_that_must_not_be_hidden(model, rule, 
     monkeypatch.setattr(bench, "judge", lambda view: replace(evidence, strength=strength))
     assert not monitor._reconsider(monitor._hidden_columns())
     assert monitor.hidden == {GRAVITY}
-    monitor._immune, replaced = set(), set(range(LAYOUT.size))
+    monitor._immune, replaced, monitor._cases[0].may_be_body = set(), set(range(LAYOUT.size)), False
     assert monitor._reconsider(monitor._hidden_columns()) == (rule != "body")
 
 

@@ -27,11 +27,13 @@ SETTINGS = {
 """A busy machine may stop the simulated servos for longer than the 0.15 s after which a servo counts as silent."""
 DIRECTIONS, ZEROS = (1, -1, 1), (0.0, 0.1, -0.2)
 _numbers = itertools.count()
+_folder = tempfile.TemporaryDirectory()
+"""The terminals' links and locks are here; it is removed when the tests end."""
 
 
 def robot_file(make, settings=None, folder=None, quantities=("position", "velocity"), **over):
     """The robot file; every servo has another sign and zero."""
-    folder = folder or tempfile.mkdtemp()
+    folder = folder or _folder.name
     signal = {"unit": "rad", "elements": list(NAMES), "stale_after": 0.05}
     signal["plausible"] = {"low": -99, "high": 99, "rate": 1e9}  # the bench moves by hand in no time
     units = {"velocity": "rad/s", "load": "1", "current": "A", "effort": "N m", "voltage": "V", "temperature": "degC"}
