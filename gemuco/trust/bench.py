@@ -180,8 +180,9 @@ class Bench:
 
     def moved_alone(self, age: int) -> Hidden:
         """Return the element that moved within about the newest `age` blocks while all others rested."""
-        count = self.relations.count
-        return moved_alone(self.recent.values()[-age - EARLIER :, :count], self.error[:count])
+        count, values = self.relations.count, self.recent.values()
+        left = self.beyond - self.relations.beyond(self.schema, values[0])
+        return moved_alone(values[-age - EARLIER :, :count], self.error[:count], left)
 
     def jumped(self, age: int) -> Hidden:
         """Return all columns that jumped since about `age` blocks; none if that is long ago, or after a knock."""

@@ -24,6 +24,9 @@ YOUNG = 100
 """What is seen within this number of blocks after an element was hidden may show that it was another one."""
 SAME = 0.3
 """An error and a jump are the same if they differ by less than this share of the jump."""
+AGREED = 20
+"""Elements agree again if they do in all of the newest `LONGEST` blocks in which they are known, at least this many:
+on a machine that stalls samples are missing now and then."""
 MOVES = 3.0
 """Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 TURN = 2.0 * np.pi
@@ -236,13 +239,25 @@ def describe(
     case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
 
 
+def has_agreed(errors: np.ndarray, least: np.ndarray) -> bool:
+    """Whether elements agree again with all others.
+
+    Args:
+        errors: Their errors in the newest blocks [standard deviations of this body], shape (LONGEST, n), NaN where
+            unknown.
+        least: Errors that matter, in the same unit, shape (n,).
+    """
+    known = np.abs(errors[np.isfinite(errors).all(axis=1)])
+    return len(known) >= AGREED and bool(known.max() < least.max())
+
+
 def has_moved(case: Case, shown: View, recent: Recent) -> bool:
     """Whether an element that was frozen has moved with its prediction."""
     if case.kind not in ("frozen", "clipped"):
         return True
     values = recent.values()[-LONGEST:]
-    healthy = shown.healthy[-len(values) :]
-    return all(np.ptp(values[:, c]) > MOVES * np.nanmean(healthy[:, c]) for c in case.cause.columns)
+    healthy, way = shown.healthy[-len(values) :], np.fmax.reduce(values) - np.fmin.reduce(values)
+    return all(way[c] > MOVES * np.nanmean(healthy[:, c]) for c in case.cause.columns)
 
 
 def kind_of(

@@ -39,19 +39,24 @@ CALM, CALM_BLOCKS = 0.3, 30
 same. It is known to be one after the second number of such blocks: while the body moves every value changes."""
 
 
-def moved_alone(values: np.ndarray, error: np.ndarray) -> Hidden:
+def moved_alone(values: np.ndarray, error: np.ndarray, left: Hidden = frozenset()) -> Hidden:
     """Return the column that moved while all others rested; empty if none did.
+
+    It is none either if one of the others left what was learned: where a wire that bore little is cut, its tension
+    falls by less than a healthy error, and a joint moves.
 
     Args:
         values: Means of some blocks [standard deviations], shape (blocks, columns), NaN where missing.
         error: Errors of a healthy prediction [standard deviations], shape (columns,).
+        left: Columns that left what was learned lately.
     """
     if len(values) < 2:
         return frozenset()
     way = np.nan_to_num(np.ptp(values, axis=0)) / error
     first = int(way.argmax())
     others = np.delete(way, first).max(initial=0.0)
-    return frozenset({first}) if others <= RESTED and way[first] >= DRIFTED * max(others, 1.0) else frozenset()
+    is_alone = others <= RESTED and way[first] >= DRIFTED * max(others, 1.0)
+    return frozenset({first}) if is_alone and left <= {first} else frozenset()
 
 
 class Jumps:

@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.bench import DOUBTFUL, LATELY, Bench
-from gemuco.trust.cases import Case, LastSearch, describe, has_moved
+from gemuco.trust.cases import Case, LastSearch, describe, has_agreed, has_moved
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence
@@ -363,8 +363,6 @@ class TrustMonitor:
         if not columns:
             return
         if evidence.highest < CALM:
-            errors = np.abs(shown.standard(bench.judge.scale)[:, columns])
-            is_silent = errors.max() < bench.judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree
             if case.cause.columns & bench.recent.repeats.stuck:
@@ -373,7 +371,8 @@ class TrustMonitor:
                 return  # it jumped away, and has not jumped back
             if bench.recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * bench.judge.scale):
                 return
-            if is_silent and np.isfinite(shown.z[:, columns]).all() and has_moved(case, shown, bench.recent):
+            agrees = has_agreed(shown.standard(bench.judge.scale)[:, columns], bench.judge.least[columns])
+            if agrees and has_moved(case, shown, bench.recent):
                 self._close(case)
             return
         if self._count - case.first > SETTLED:

@@ -98,5 +98,7 @@ def test_the_only_one_that_moves_while_all_others_rest_is_named() -> None:
     assert not moved_alone(values, ERROR)
     values[:, LOAD] = np.linspace(0.0, 0.5, 6)
     assert moved_alone(values, ERROR) == {LOAD}
+    assert moved_alone(values, ERROR, frozenset({LOAD})) == {LOAD}, "it drifted out of what was learned"
+    assert not moved_alone(values, ERROR, frozenset({JOINT})), "a wire was cut"
     values[:, TIP] = np.linspace(0.0, 0.2, 6)
     assert not moved_alone(values, ERROR), "the body moves"

@@ -9,6 +9,7 @@ from test_trust_proposed import moved
 from test_trust_tools import CHANGE, LAYOUT, SAMPLES, TOOLS, body, model, walk
 
 from gemuco.trust.cases import Case
+from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK
 from gemuco.trust.hypotheses import CANDIDATES, Cause, explain
 from gemuco.trust.monitor import BESIDE, TrustMonitor
@@ -86,6 +87,19 @@ def test_a_wrong_suspect_is_shown_again_and_the_right_one_hidden(model, seed):
         monitor.add(block, number * BLOCK)
     assert SHOULDER in monitor.hidden
     assert GRAVITY not in monitor.hidden
+
+
+@pytest.mark.parametrize(("every", "returns"), [(1000, True), (8, True), (2, False)])
+def test_an_element_that_agrees_returns_though_samples_are_missing_now_and_then(model, every, returns):
+    """A stall of the machine leaves a block without samples; if every other one is, too little is known."""
+    rows, monitor = body(walk(CHANGE + 60, 90), TOOLS["short"]), TrustMonitor(model)
+    for number, block in enumerate(blocks_of(model, rows)):
+        if number == CHANGE:
+            hide(monitor, SHOULDER, kind="frozen")
+        if number >= CHANGE - LONGEST and number % every == 0:
+            block[:] = np.nan
+        monitor.add(block, number * BLOCK)
+    assert (SHOULDER not in monitor.hidden) == returns
 
 
 @pytest.mark.parametrize("rule", ["trusted by hand", "not replaced", "body", "a part that changed"])
