@@ -33,6 +33,8 @@ RETRY_AFTER = 0.02
 """A client waits this long [s] before it asks an absent service again: connections are made in the background."""
 APPEAR = 2.0
 """A service that is absent for this long [s] is reported; a verb that computes may take longer to answer."""
+TAKEN = 0.1
+"""A service took a query that ends without an answer after this time [s]; the connection was lost meanwhile."""
 LONGEST_ERROR = 1000
 CACHED_CALLERS = 64
 """The attachments of this many callers are cached in both directions."""
@@ -238,13 +240,15 @@ def ask(
     payload = _pack(dict(arguments or {}))
     late = False
     while (remaining := deadline - time.monotonic()) > 0:
-        attachment = _attachment(caller if isinstance(caller, Caller) else caller())
+        attachment, asked = _attachment(caller if isinstance(caller, Caller) else caller()), time.monotonic()
         for reply in session.get(key, payload=payload, attachment=attachment, timeout=remaining):
             if reply.ok is not None:
                 return _result(key, reply.ok)
             late = True
         # Without a queryable, zenoh returns at once: the service is absent, or its connection is being made.
-        if not late and time.monotonic() > appear:
+        if (ended := time.monotonic()) - asked > TAKEN:
+            appear = ended + APPEAR
+        if not late and ended > appear:
             break
         time.sleep(max(0.0, min(RETRY_AFTER, deadline - time.monotonic())))
     raise _no_answer(session, key, timeout if late else min(timeout, APPEAR), late)

@@ -1,6 +1,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -102,6 +103,24 @@ def test_a_verb_that_takes_too_long_is_told(pair: Pair) -> None:
     with pytest.raises(TooSlow, match=r"did not answer 'slow' within 0.2 s. Is it busy\?"):
         pair.ask(key, timeout=0.2)
     token.undeclare()
+
+
+def test_a_query_whose_connection_is_lost_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service took the query and was connected anew; a busy machine may need seconds for that."""
+    monkeypatch.setattr(query, "APPEAR", 0.2)
+    answer = SimpleNamespace(ok=SimpleNamespace(attachment=None, payload=zenoh.ZBytes(query._pack({"ok": {"n": 1}}))))
+    replies = iter([[], [], [answer]])
+
+    class Losing:
+        def get(self, key: str, **_: object) -> list[Any]:
+            if (reply := next(replies)) == [] and not asked:
+                time.sleep(0.3)
+            asked.append(key)
+            return reply
+
+    asked: list[str] = []
+    assert query.ask(Losing(), keys.verb("arm", "model", "normal"), timeout=5.0) == {"n": 1}  # type: ignore[arg-type]
+    assert len(asked) == 3
 
 
 def test_a_service_that_is_not_there_is_not_called_busy(pair: Pair) -> None:
