@@ -27,6 +27,10 @@ TRIES = 3
 """A target is sent at most this often if the HAL stops the robot before the end."""
 
 
+class NotFollowing(ServiceError):
+    """The robot does not follow after all attempts to engage the controller."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stage:
     """One stage of a story.
@@ -61,13 +65,13 @@ class Actor:
         """Engage the controller, after a reset if the robot or a drive has a fault; try again after a refusal.
 
         Raises:
-            ServiceError: The robot does not follow.
+            NotFollowing: The robot does not follow.
         """
         refusal = ""
         deadline = time.monotonic() + FOLLOWS_WITHIN
         while not self._follows():
             if time.monotonic() > deadline:
-                raise ServiceError(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
+                raise NotFollowing(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
             try:
                 if self._mode() == "fault" or not self._is_healthy():
                     self._client.reset()

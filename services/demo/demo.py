@@ -19,10 +19,9 @@ from hal.errors import ConfigError
 from hal.robot import open_robot
 from services.client import Client
 from services.demo import arm_story, pace, report, story, tool_story
-from services.demo.actor import Actor
+from services.demo.actor import Actor, NotFollowing
 from services.demo.arm_story import ArmStory
 from services.demo.live_view import Play, Screen, waiting
-from services.demo.pace import CycleCounts
 from services.demo.page import playing_along
 from services.demo.report import CLIENT, Ending
 from services.demo.story import MUSCLE, Story
@@ -130,10 +129,15 @@ def running(
 
             actor = Actor(client, idle, screen.report)
             with waiting(console, f"counting whether this machine keeps {rates.hal:g} Hz"):
-                counts = pace.count_cycles(client, actor.wait)
-            if not counts.is_kept:
-                console.print(too_slow(counts, is_last))
-            if counts.is_kept or is_last:
+                reason = too_slow(client, actor, is_last)
+            if reason:
+                consequence = (
+                    "The story is played in spite of this, and the HAL may stop the robot."
+                    if is_last
+                    else f"All processes are started again at {rates.hal / 2:g} Hz."
+                )
+                console.print(f"[yellow]This machine does not keep {rates.hal:g} Hz: {reason} {consequence}[/]")
+            if not reason or is_last:
                 try:
                     yield Cast(load_robot(file), client, actor, remote, screen)
                 except ServiceUnavailable:
@@ -143,14 +147,20 @@ def running(
             supervisor.stop_all()
 
 
-def too_slow(counts: CycleCounts, is_last: bool) -> str:
-    """Return sentences on a rate that is not kept, and on the consequence."""
-    consequence = (
-        "The story is played in spite of this, and the HAL may stop the robot."
-        if is_last
-        else f"All processes are started again at {counts.rate / 2:g} Hz."
-    )
-    return f"[yellow]This machine does not keep {counts.rate:g} Hz: {counts}. {consequence}[/]"
+def too_slow(client: Client, actor: Actor, is_last: bool) -> str:
+    """Return a sentence on why this machine does not keep the rate while the robot is engaged; empty if it does.
+
+    Raises:
+        NotFollowing: The robot does not follow at the last rate.
+    """
+    try:
+        actor.engage()
+    except NotFollowing as error:
+        if is_last:
+            raise
+        return str(error)
+    counts = pace.count_cycles(client, actor.wait)
+    return "" if counts.is_kept else f"{counts}."
 
 
 def control_of(robot: RobotConfig) -> ControlConfig:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from hal.config import RobotConfig, load_robot
 from services.demo import demo, pace
+from services.demo.actor import Actor, NotFollowing
 from services.demo.pace import CycleCounts, at_rates, count_cycles, halved
 from services.errors import ServiceError, ServiceUnavailable
 from services.model.artifacts import fingerprint
@@ -23,7 +24,7 @@ ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 
 def status(second: int, ticks: int, skipped: int, incomplete: int, rate: float = 200.0) -> Status:
     loop = {"rate_wanted": rate, "ticks": ticks, "skipped": skipped, "late_p99": 0.0031}
-    facts = {"incomplete": incomplete}
+    facts = {"incomplete": incomplete, "commands": {"accepted": ticks // 2, "refused": skipped // 10}}
     return Status(stamp_ns=second * 10**9, service="hal", state="running", loops={"hal": loop}, facts=facts)
 
 
@@ -51,17 +52,27 @@ def arm(tmp_path: Path) -> Path:
 def test_the_pace_is_what_happened_between_two_statuses() -> None:
     client = Told(status(1, 500, 90, 40), status(1, 500, 90, 40), status(5, 1290, 100, 43), status(5, 1290, 100, 43))
     found = count_cycles(client, until)  # type: ignore[arg-type]
-    assert found == CycleCounts(rate=200.0, cycles=790, skipped=10, incomplete=3, late=0.0031)
+    assert found == CycleCounts(200.0, cycles=790, skipped=10, incomplete=3, late=0.0031, commands=396, refused=1)
     assert found.is_kept
-    assert str(found) == "10 of 800 cycles were skipped and 3 incomplete, 99 of 100 began within 3.1 ms"
+    cycles, commands = "10 of 800 cycles were skipped and 3 incomplete", "1 of 396 commands came too late"
+    assert str(found) == f"{cycles}, 99 of 100 began within 3.1 ms, {commands}"
 
 
 @pytest.mark.parametrize(
-    ("cycles", "skipped", "incomplete", "is_kept"),
-    [(800, 0, 0, True), (784, 16, 39, True), (780, 20, 0, False), (800, 0, 41, False), (0, 0, 0, False)],
+    ("cycles", "skipped", "incomplete", "refused", "is_kept"),
+    [
+        (800, 0, 0, 0, True),
+        (784, 16, 78, 2, True),
+        (780, 20, 0, 0, False),
+        (800, 0, 81, 0, False),
+        (800, 0, 0, 3, False),
+        (0, 0, 0, 0, False),
+    ],
 )
-def test_a_rate_is_kept_if_few_cycles_are_missed(cycles: int, skipped: int, incomplete: int, is_kept: bool) -> None:
-    assert CycleCounts(200.0, cycles, skipped, incomplete, 0.0).is_kept is is_kept
+def test_a_rate_is_kept_if_few_cycles_are_missed(
+    cycles: int, skipped: int, incomplete: int, refused: int, is_kept: bool
+) -> None:
+    assert CycleCounts(200.0, cycles, skipped, incomplete, 0.0, commands=100, refused=refused).is_kept is is_kept
 
 
 def test_a_hal_that_says_nothing_is_told() -> None:
@@ -131,15 +142,23 @@ def test_what_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, arm: Pa
 class Processes:
     """Stands for the supervisor and all that it starts; keeps the highest rate that it is told to."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, highest: float, cores: int = 4) -> None:
-        self.highest, self.rates, self.stopped = highest, [], 0
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, highest: float, cores: int = 4, follows: float = 1e3) -> None:
+        self.highest, self.follows, self.stopped, self.is_engaged = highest, follows, 0, False
+        self.rates: list[float] = []
         monkeypatch.setattr(pace, "cores", lambda: cores)
         monkeypatch.setattr(demo, "start", self._start)
         monkeypatch.setattr(demo, "Client", self._client)
         monkeypatch.setattr(pace, "count_cycles", self._look)
+        monkeypatch.setattr(Actor, "engage", self._engage)
 
     def _start(self, robot: RobotConfig, file: Path, *_: object) -> None:
         self.rates.append(load_robot(file).rates.hal)
+        self.is_engaged = False
+
+    def _engage(self, *_: object) -> None:
+        if self.rates[-1] > self.follows:
+            raise NotFollowing("The arm did not begin to follow.")
+        self.is_engaged = True
 
     @contextmanager
     def _client(self, name: str) -> Iterator[None]:
@@ -147,7 +166,8 @@ class Processes:
 
     def _look(self, *_: object) -> CycleCounts:
         rate = self.rates[-1]
-        return CycleCounts(rate, 700, 0 if rate <= self.highest else 100, 0, 0.002)
+        assert self.is_engaged
+        return CycleCounts(rate, 700, 0 if rate <= self.highest else 100, 0, 0.002, 100, 0)
 
     def check(self) -> None:
         pass
@@ -181,6 +201,24 @@ def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
     assert [sentence for sentence in sentences if sentence not in report] == []
     assert bool(report) is bool(sentences)
     assert list(arm.parent.glob("*.yaml")) == [arm]
+
+
+def test_a_rate_at_which_the_arm_does_not_follow_is_not_kept(monkeypatch: pytest.MonkeyPatch, arm: Path) -> None:
+    processes, console = Processes(monkeypatch, 200, follows=100), Console(record=True, width=300)
+    robot = load_robot(arm)
+    with demo.running(robot, arm, 1, arm.parent, processes, console, False) as cast:  # type: ignore[arg-type]
+        assert cast.robot.rates.hal == 100
+    assert "200 Hz: The arm did not begin to follow. All processes are started again" in console.export_text()
+
+
+def test_an_arm_that_follows_at_no_rate_ends_the_demo(monkeypatch: pytest.MonkeyPatch, arm: Path) -> None:
+    processes = Processes(monkeypatch, 200, follows=0)
+    with (
+        pytest.raises(NotFollowing),
+        demo.running(load_robot(arm), arm, 1, arm.parent, processes, Console(), False),  # type: ignore[arg-type]
+    ):
+        raise AssertionError("the story is not played")
+    assert processes.rates == [200, 100, 50]
 
 
 @pytest.mark.parametrize("has_ended", [True, False])
