@@ -1,14 +1,16 @@
 """Cut muscles: how often a right sensor is hidden after a wire of the muscle-driven arm was cut.
 
-    python -m studies.accuracy.cut_muscles [--seeds 1 2 3]
+    python -m studies.accuracy.cut_muscles [--seeds 1 2 3] [--rests 1.5]
 
 The model is that of `studies.accuracy.lies`; it has seen no cut. Each seed is one recording of random motion per
 muscle, whose wire is cut after 40 s. The arm goes on moving as commanded for 8 s: with a muscle less it leaves the
 postures and tensions that were learned. Right are the sensors of the joints and of all other muscles; tension and
-length of the cut one contradict them. The robot of the demo stops when the first of these is hidden.
+length of the cut one contradict them. The robot of the demo stops when the first of these is hidden. With `--rests` the
+arm rests since this time [s] before the cut.
 """
 
 import argparse
+import math
 import pickle
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,12 +33,20 @@ AT_FIRST = 1.0
 """What is hidden within this time [s] of the first verdict counts as what was hidden at first."""
 
 
-def recording(robot: RobotConfig, muscle: str, seed: int) -> dict[str, np.ndarray]:
-    """Return signal -> samples (count, n) [unit], from runs/cut_muscles if it was made before."""
-    file = CACHE / f"{muscle}_{seed}.pkl"
+def recording(robot: RobotConfig, muscle: str, seed: int, rests: float | None) -> dict[str, np.ndarray]:
+    """Return signal -> samples (count, n) [unit], from runs/cut_muscles if it was made before.
+
+    Args:
+        robot: The robot.
+        muscle: The muscle that is cut.
+        seed: Seed of the motion.
+        rests: The arm rests since this time [s] before the cut; None if it moves.
+    """
+    file = CACHE / f"{muscle}_{seed}{'' if rests is None else f'_{rests:g}'}.pkl"
     if not file.exists():
         cut = f"muscle_cut:{muscle}"
-        rows = record(robot, ARM, seed, float(RATE), BEFORE + AFTER, cut, breaks_at=BEFORE)
+        still = math.inf if rests is None else BEFORE - rests
+        rows = record(robot, ARM, seed, float(RATE), BEFORE + AFTER, cut, breaks_at=BEFORE, rests_at=still)
         CACHE.mkdir(parents=True, exist_ok=True)
         file.write_bytes(pickle.dumps(rows))
     return dict(pickle.loads(file.read_bytes()))
@@ -71,11 +81,12 @@ def _right(names: set[str], muscle: str) -> set[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--rests", type=float)
     arguments = parser.parse_args()
     robot, schema = load_robot(Path("robots/musashi_arm.yaml")), body_of("musashi_arm").schema
     table = Table("muscle", "noticed", "median", "right sensor hidden at first", "right sensor hidden within 8 s")
     for muscle in robot.signals[TENSION].elements:
-        plays = [play(schema, recording(robot, muscle, seed)) for seed in arguments.seeds]
+        plays = [play(schema, recording(robot, muscle, seed, arguments.rests)) for seed in arguments.seeds]
         table.add_row(*row_of(muscle, plays))
         Console().print(f"{muscle}: " + "; ".join(str(p[:3]) for p in plays), style="dim")
     Console().print(table)

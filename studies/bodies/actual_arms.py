@@ -1,5 +1,6 @@
 """The trained model of the muscle-driven arm, and random motion of its actual variants."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
@@ -19,12 +20,17 @@ from simulators.direct import DirectDevice, WorldClock
 
 
 def motion(
-    robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float
+    robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float, rests_at: float = math.inf
 ) -> Iterator[Mapping[str, np.ndarray]]:
-    """Yield samples [unit] at a rate [Hz] of random motion that lasts `duration` [s of the arm's time]."""
+    """Yield samples [unit] at a rate [Hz] of random motion that lasts `duration` [s of the arm's time].
+
+    From the time `rests_at` [s] on the arm rests where it is commanded to be then.
+    """
     playground = DirectPlayground(body, rate)
     for command, hold in registry.load_object(robot.collect["motion"])(robot, seed):
         yield from playground.play(command, hold)
+        if playground.elapsed() > rests_at:
+            yield from playground.play(command, duration - playground.elapsed())
         if playground.elapsed() > duration:
             return
 
@@ -42,8 +48,12 @@ def record(
     part: str = "",
     contact: Contact | None = None,
     breaks_at: float = 0.0,
+    rests_at: float = math.inf,
 ) -> dict[str, np.ndarray]:
-    """Return signal -> samples (count, n) [unit] of one actual arm, of which a part breaks at a time [s]."""
+    """Return signal -> samples (count, n) [unit] of one actual arm, of which a part breaks at a time [s].
+
+    It moves at random until the time `rests_at` [s].
+    """
     world = registry.load_object(robot.simulator or "", "simulator", ("world",)).world("actual", arm)
     if part and not breaks_at:
         world.break_part(part)
@@ -52,7 +62,7 @@ def record(
     clock = WorldClock(world)
     with Robot(robot, [DirectDevice(robot, world, clock)], clock=clock, source="simulated") as body:
         rows = []
-        for row in motion(robot, body, seed, rate, duration):
+        for row in motion(robot, body, seed, rate, duration, rests_at):
             rows.append(row)
             if part and breaks_at and len(rows) == round(breaks_at * rate):
                 world.break_part(part)
