@@ -75,8 +75,10 @@ def robot(tmp_path):
     ("text", "report"),
     [
         (f"<robot {XACRO}><xacro:macro name='a'/><link name='a'/></robot>", "is a xacro file. Convert it first"),
+        ("<robot><xacro:macro name='a'/><link name='a'/></robot>", "is a xacro file"),
         ("<robot><link name='${prefix}a'/></robot>", "is a xacro file"),
         ("<robot><link name='a'", "is not XML"),
+        ("<robot><drake:a/><link name='a'", "is not XML"),
         ("<mujoco/>", "is an MJCF file of MuJoCo. `gemuco init` makes a URDF of it."),
         ("<sdf/>", "is an SDF file of Gazebo"),
         ("<html/>", "is XML of <html>"),
@@ -100,6 +102,15 @@ def test_what_is_no_arm_is_refused_in_a_sentence(tmp_path, text, report):
         choose_arm(read_tree(written(tmp_path, text)))
     assert report in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("declared", ["", "xmlns:drake='http://drake.mit.edu'"])
+def test_extensions_of_other_programs_are_left_out(tmp_path, declared):
+    """Nobody declares their prefix; an empty line before the declaration is no XML either, and ROS reads both."""
+    text = ARM.replace("<limit lower", "<limit drake:acceleration='9' lower").replace("<robot", f"<robot {declared}", 1)
+    text = text.replace("</robot>", "<drake:joint name='a'><link name='b'/></drake:joint></robot>")
+    draft = describe(written(tmp_path, f'\n<?xml version="1.0"?>\n{text}'), None, None, tmp_path)
+    assert draft.text == describe(written(tmp_path), None, None, tmp_path).text
 
 
 def test_a_file_that_is_not_there_or_a_folder(tmp_path):
