@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 import zenoh
 
+from hal.finding.urdf import root_of
 from services.errors import ServiceError
 from services.ros2 import cdr, messages
 from services.ros2.names import Entity, Kind, ros_name
@@ -158,7 +159,7 @@ def _text(sample: zenoh.Sample) -> str:
 def _limits(urdf: str) -> dict[str, _Limit]:
     """Return joint -> its limits in a URDF; empty if it cannot be read."""
     try:
-        root = Tree.fromstring(urdf)
+        root = root_of(urdf)
     except Tree.ParseError:
         return {}
     limits = {}

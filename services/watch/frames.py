@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hal.finding.urdf import root_of
 from services.errors import ServiceError
 
 Numbers = tuple[float, ...]
@@ -57,7 +58,7 @@ class Frames:
     def __init__(self, path: Path) -> None:
         try:
             self.text = path.read_text()
-            root = Tree.fromstring(self.text)
+            root = root_of(self.text)
             self.joints = tuple(_joint(element) for element in root.findall("joint"))
             names = [element.get("name", "") for element in root.findall("link")]
         except OSError as error:

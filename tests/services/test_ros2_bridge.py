@@ -10,7 +10,7 @@ from ros_listener import Listener, bridge, eventually, free_port, ros_network
 from talking_robot import TalkingRobot
 
 from services.process.router import routing
-from services.ros2 import cdr, names
+from services.ros2 import cdr, draft, names
 from services.ros2.bridge import run_bridge
 from services.ros2.names import Kind, read_token
 from services.ros2.node import NameTaken, Network, Node
@@ -34,6 +34,16 @@ def network() -> Iterator[Network]:
 def frames(tmp_path: Path) -> Frames:
     (tmp_path / "arm.urdf").write_text(URDF)
     return Frames(tmp_path / "arm.urdf")
+
+
+def test_a_urdf_with_extensions_of_other_programs_is_read(tmp_path: Path) -> None:
+    limit = "<limit drake:acceleration='2' lower='-1' upper='1' velocity='3'/><drake:gear ratio='9'/>"
+    text = URDF.replace("<axis", f"{limit}<axis")
+    (tmp_path / "arm.urdf").write_text(text)
+    frames = Frames(tmp_path / "arm.urdf")
+    assert [joint.name for joint in frames.joints] == ["shoulder", "elbow"]
+    assert frames.text == text
+    assert {name: limit.rate for name, limit in draft._limits(text).items()} == {"shoulder": 3.0, "elbow": 3.0}
 
 
 def statuses(message: dict[str, Any]) -> dict[str, tuple[int, str]]:

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
-from xml.parsers import expat
 
 import numpy as np
 
 from hal.errors import ConfigError
+from hal.finding.urdf import drop_extensions, root_of
 
 TURNING = ("revolute", "continuous")
 OTHERS = {"sdf": "an SDF file of Gazebo", "COLLADA": "a COLLADA file"}
@@ -134,7 +134,7 @@ def _parsed(path: Path) -> Element:
     if path.is_dir():
         raise ConfigError(f"'{path}' is a folder. Give the URDF file in it.")
     try:
-        root = _root(path.read_bytes().lstrip())
+        root = root_of(path.read_bytes())
     except FileNotFoundError:
         raise ConfigError(f"There is no file '{path}'. Is its folder right?") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -154,41 +154,8 @@ def _parsed(path: Path) -> Element:
         )
     if root.find("link") is None:
         raise ConfigError(f"'{path}' has no link, so it describes no robot.")
-    _drop_extensions(root)
+    drop_extensions(root)
     return root
-
-
-def _root(text: bytes) -> Element:
-    """Return the root element; elements and attributes of a prefix that is not declared keep it in their names.
-
-    Such extensions (`drake:acceleration`) are usual, and the parser of ROS takes no notice of namespaces.
-
-    Raises:
-        ElementTree.ParseError: It is not XML.
-    """
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        if error.code != expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]:
-            raise
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    try:
-        parser.Parse(text, True)
-    except expat.ExpatError as error:
-        raise ElementTree.ParseError(str(error)) from None
-    return builder.close()
-
-
-def _drop_extensions(element: Element) -> None:
-    """Remove elements and attributes with a prefix that is not declared; they would be no XML in another file."""
-    for name in [name for name in element.attrib if ":" in name and "}" not in name]:
-        del element.attrib[name]
-    for child in list(element):
-        if ":" in child.tag and "}" not in child.tag:
-            element.remove(child)
-        else:
-            _drop_extensions(child)
 
 
 def _joint(element: Element, path: Path) -> Joint:
