@@ -13,6 +13,7 @@ from test_bench_devices import DRIVE, UNSTATED, with_lines, without_defaults
 from hal.config import BusConfig, load_robot
 from hal.errors import ConfigError
 from hal.finding.draft.draft import Draft, draft_bus, draft_folder
+from hal.finding.draft.parts import Names
 from hal.finding.scan import scan
 from hal.finding.tap import Tap
 from services.model.model_config import collect_config
@@ -213,3 +214,13 @@ def test_a_silent_bus_is_refused(tmp_path: Path) -> None:
         ConfigError, match=r"No node on can0 has a driver \(0 nodes, 0 other identifiers\)\. Are they.*Only listened"
     ):
         draft_bus(result, "", 1_000_000, None, "none", tmp_path, SHIPPED)
+
+
+def test_a_name_is_a_text_in_yaml() -> None:
+    names = Names()
+    assert [names.new(text) for text in ("On", "8 a", "PanAxis", "Pan axis")] == [
+        "node_on",
+        "node_8_a",
+        "pan_axis",
+        "pan_axis_2",
+    ]

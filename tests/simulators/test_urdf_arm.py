@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from hal.config import load_robot
 from hal.errors import ConfigError
@@ -111,6 +112,15 @@ def test_extensions_of_other_programs_are_left_out(tmp_path, declared):
     text = text.replace("</robot>", "<drake:joint name='a'><link name='b'/></drake:joint></robot>")
     draft = describe(written(tmp_path, f'\n<?xml version="1.0"?>\n{text}'), None, None, tmp_path)
     assert draft.text == describe(written(tmp_path), None, None, tmp_path).text
+
+
+def test_joints_named_by_numbers_or_truth_values_make_a_robot_file(tmp_path):
+    text = ARM.replace('"shoulder pan"', '"8"').replace('"elbow"', '"on"').replace("tool0", "no").replace("My Arm", "7")
+    draft = describe(written(tmp_path, text), None, None, tmp_path)
+    content = yaml.safe_load(draft.text)
+    assert content["signals"]["joint_position"]["elements"] == ["joint_8", "joint_on", "wrist"]
+    assert (content["robot"], content["tip"]) == ("robot_7", "no")
+    assert set(content["devices"]) >= {"joint_8_drive", "joint_on_encoder"}
 
 
 def test_a_file_that_is_not_there_or_a_folder(tmp_path):

@@ -4,6 +4,8 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
+import yaml
+
 NAME, CAMEL = re.compile(r"[^A-Za-z0-9]+"), re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 STALE_AFTER = 0.06
 """A value of a node that answers each cycle is stale after this time [s], at the drafted rate of 100 Hz."""
@@ -53,6 +55,11 @@ class Part:
     is_drive: bool = False
 
 
+def is_text(name: str) -> bool:
+    """Whether YAML takes a name without quotes for a text, as it does not with `8` and `on`."""
+    return isinstance(yaml.safe_load(name), str)
+
+
 @dataclass(slots=True)
 class Names:
     """Names that were given, so that no two devices have the same one."""
@@ -62,7 +69,7 @@ class Names:
     def new(self, text: str) -> str:
         """Return a name of lower-case letters, digits and underscores, with a number if it was given before."""
         base = NAME.sub("_", CAMEL.sub("_", text)).strip("_").lower() or "node"
-        base = base if base[0].isalpha() else f"node_{base}"
+        base = base if base[0].isalpha() and is_text(base) else f"node_{base}"
         name, number = base, 2
         while name in self.given:
             name, number = f"{base}_{number}", number + 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.errors import ConfigError
+from hal.finding.draft.parts import is_text
 from simulators.robots.urdf_arm.tree import Joint, Tree, numbers
 
 MOST_JOINTS = 16
@@ -73,8 +74,14 @@ def _slide(joint: Joint) -> float:
 
 
 def element_name(text: str) -> str:
-    """Return a name of letters, digits and underscores."""
-    return re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_") or "joint"
+    """Return a name of letters, digits and underscores, which YAML takes for no number and no truth value."""
+    name = plain_name(text) or "joint"
+    return name if is_text(name) else f"joint_{name}"
+
+
+def plain_name(text: str) -> str:
+    """Return a text with an underscore in place of each run of other characters than letters and digits."""
+    return re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
 
 
 def arm_of(tree: Tree, joints: Sequence[str], tip: str) -> Arm:

@@ -10,8 +10,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from hal.finding.draft.parts import is_text
 from simulators.nodes.canopen.spec import EDS_FOLDER
-from simulators.robots.urdf_arm.choice import Arm, choose_arm, element_name
+from simulators.robots.urdf_arm.choice import Arm, choose_arm, plain_name
 from simulators.robots.urdf_arm.mjcf import convert, is_mjcf
 from simulators.robots.urdf_arm.survey import ACCELERATION, Survey, survey
 from simulators.robots.urdf_arm.tree import Tree, read_tree, tree_of
@@ -152,8 +153,8 @@ def _draft(tree: Tree, urdf: str, tip: str | None, name: str | None, more: Seque
 
 def robot_name(text: str) -> str:
     """Return a name of a robot made of a text: lower-case letters, digits and underscores."""
-    name = re.sub(r"_+", "_", element_name(text).lower())
-    return name if name[0].isalpha() else f"robot_{name}"
+    name = re.sub(r"_+", "_", plain_name(text).lower()) or "arm"
+    return name if name[0].isalpha() and is_text(name) else f"robot_{name}"
 
 
 def _beside(path: Path, folder: Path) -> str:
@@ -163,7 +164,8 @@ def _beside(path: Path, folder: Path) -> str:
 
 def _quoted(text: str) -> str:
     """Return a text as YAML has it, in quotes if it has other characters than those of a path."""
-    return text if re.fullmatch(r"[A-Za-z_./][\w./-]*", text) else "'" + text.replace("'", "''") + "'"
+    is_plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text) and is_text(text)
+    return text if is_plain else "'" + text.replace("'", "''") + "'"
 
 
 def _row(values: Iterable[float]) -> str:
