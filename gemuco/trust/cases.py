@@ -138,17 +138,18 @@ class Case:
         columns = self.cause.columns
         return columns.union(*(part for part in parts if columns <= part))
 
-    def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden]) -> bool:
+    def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden], beyond: Hidden) -> bool:
         """Whether another element replaces it: one of those that look alike, or one with much more evidence.
 
         It is held against all sensors of its part of the body.
 
         Args:
-            again: The element that explains best what is seen now; the case must not be bound.
+            again: The element that explains best what is seen now.
             evidence: The evidence now.
-            parts: Columns of each part of the body with several sensors.
+            parts: As in `is_bound`.
+            beyond: As in `is_bound`.
         """
-        if again.columns == self.cause.columns:
+        if again.columns == self.cause.columns or self.is_bound(again, parts, beyond):
             return False
         own = float(evidence.strength[list(self._whole(parts) - again.columns)].max())
         return float(evidence.strength[again.lead]) > (1.0 if again.columns < self.cause.columns else SURE) * own

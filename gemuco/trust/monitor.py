@@ -249,11 +249,13 @@ class TrustMonitor:
     def _reconsider(self, hidden: Hidden) -> bool:
         """Give a young case to another element if that explains also what contradicts the one so far; say whether."""
         bench = self._bench
+        beyond = bench.beyond if self._parts else frozenset()  # a cut wire explains what contradicts others
         for case in [case for case in self._cases if case.is_young(self._count)]:
             columns = case.cause.columns
             evidence = bench.judge(bench.shown(hidden - columns))
             again = self._explain(evidence, hidden - columns, is_new=False)
             is_other = again.is_element and not again.columns <= columns and self._may_take(again, case)
+            is_other = is_other and not case.is_bound(again, self._parts, beyond)
             if is_other and evidence.strength[again.lead] > evidence.strength[list(columns)].max():
                 case.cause = again
                 self._describe(case, hidden - columns | again.columns)
@@ -265,9 +267,7 @@ class TrustMonitor:
         elements, others = self._at(replace(case, cause=cause)), self.hidden - self._at(case)
         is_sensor = not cause.columns & self._bench.environment
         is_used = cause.cause == "either" and self._config.pairs == "use"
-        if is_used or not is_sensor or case.is_bound(cause, self._parts, self._bench.beyond):
-            return False
-        return not self._immune & elements and self._replaces(others | elements)
+        return is_sensor and not is_used and not self._immune & elements and self._replaces(others | elements)
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -384,9 +384,10 @@ class TrustMonitor:
         if not case.cause.is_element:
             return
         again = self._explain(evidence, rest, is_new=False)
+        is_possible = again.cause == "element" and self._may_take(again, case)
         if again.cause == "part" and case.cause.columns < again.columns:
             case.cause, case.may_be_body = again, True
-        elif again.cause == "element" and self._may_take(again, case) and case.yields_to(again, evidence, self._parts):
+        elif is_possible and case.yields_to(again, evidence, self._parts, bench.beyond):
             case.cause = again
             self._describe(case, rest | again.columns)
 

@@ -102,16 +102,16 @@ def test_a_sensor_of_a_part_yields_to_a_joint_with_much_more_evidence_only() -> 
     case, joint = Case(Cause(frozenset({TENSION}), "element", TENSION), 1, 1, 1), frozenset({JOINT})
     for strength, yields in ((70.0, False), (110.0, True)):
         whole = evidence(joint=strength, tension=20.0, length=50.0)
-        assert case.yields_to(Cause(joint, "element", JOINT), whole, [MUSCLE]) == yields
+        assert case.yields_to(Cause(joint, "element", JOINT), whole, [MUSCLE], frozenset()) == yields
         own = Cause(frozenset({LENGTH}), "element", LENGTH)
-        assert case.yields_to(own, whole, [MUSCLE]), "2.5 times its evidence"
-        assert not case.yields_to(case.cause, whole, [MUSCLE])
+        assert case.yields_to(own, whole, [MUSCLE], frozenset()), "2.5 times its evidence"
+        assert not case.yields_to(case.cause, whole, [MUSCLE], frozenset())
 
 
 def test_one_of_two_that_look_alike_needs_more_evidence_only() -> None:
     case = Case(Cause(frozenset({JOINT, OTHER}), "either", JOINT), 1, 1, 1)
     alone = Cause(frozenset({JOINT}), "element", JOINT)
-    assert case.yields_to(alone, evidence(joint=10.0), [])
+    assert case.yields_to(alone, evidence(joint=10.0), [], frozenset())
 
 
 @pytest.mark.parametrize(
