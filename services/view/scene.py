@@ -1,6 +1,7 @@
 """The robot in 3D, as the model knows it; where sensors are silent or distrusted, a ghost shows what they measured."""
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ VIEW = np.array([1.0, -0.6, 0.3]) / np.linalg.norm([1.0, -0.6, 0.3])
 """The camera looks at the robot from this direction."""
 MOVED = 0.01
 """A camera this far from where it was put, as a share of the robot's radius, was moved by the person."""
+PLACES = 8
+"""This many places of the camera are remembered: while a window is resized reports are that many behind."""
 MARGIN = 1.1
 """The picture is this factor larger than the robot."""
 PHONE, TOP = 0.75, 0.44
@@ -201,23 +204,24 @@ class Scene:
         A browser first reports the shape of the whole window, and later that of the picture beside the panels.
         """
         camera = client.camera
-        fitted, shape, top = np.zeros(3), 0.0, 0.0
-        is_there = False
-        """Whether the browser has reported the camera at `fitted`; reports from before it was put there are no move."""
+        shape, top = 0.0, 0.0
+        places = deque([camera.position.copy()], PLACES)
+        """Where the camera was at first and was put since: a report from there may have been on its way meanwhile, and
+        one from elsewhere is of a person who moved it."""
 
         def fit(_: "viser.CameraHandle") -> None:
-            nonlocal fitted, shape, top, is_there
+            nonlocal shape, top
             if not (camera.image_width and camera.image_height):
                 return  # a window that is minimised
-            is_near = bool(np.linalg.norm(camera.position - fitted) < MOVED * self._radius)
-            if camera.aspect == shape or (is_there and not is_near):
-                is_there |= is_near
+            was_put = min(np.linalg.norm(camera.position - place) for place in places) < MOVED * self._radius
+            if camera.aspect == shape or not was_put:
                 return
             top = top or (TOP if camera.aspect < PHONE else 1.0)
-            shape, is_there = camera.aspect, False
-            fitted, target = self.fit(shape, camera.fov, top)
+            shape = camera.aspect
+            place, target = self.fit(shape, camera.fov, top)
+            places.append(place)
             with client.atomic():
-                camera.position, camera.look_at = fitted, target
+                camera.position, camera.look_at = place, target
 
         fit(camera)
         camera.on_update(fit)
