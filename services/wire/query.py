@@ -219,6 +219,8 @@ def ask(
 ) -> dict[str, Any]:
     """Ask a service to do its verb, and wait for the answer.
 
+    A query without an answer is asked again until the deadline, so a service may get it twice.
+
     Args:
         session: An open session.
         key: From `keys.verb`.
@@ -238,7 +240,7 @@ def ask(
     start = time.monotonic()
     deadline, appear = start + timeout, start + min(timeout, APPEAR)
     payload = _pack(dict(arguments or {}))
-    late = False
+    late, waited = False, timeout
     while (remaining := deadline - time.monotonic()) > 0:
         attachment, asked = _attachment(caller if isinstance(caller, Caller) else caller()), time.monotonic()
         for reply in session.get(key, payload=payload, attachment=attachment, timeout=remaining):
@@ -249,9 +251,10 @@ def ask(
         if (ended := time.monotonic()) - asked > TAKEN:
             appear = ended + APPEAR
         if not late and ended > appear:
+            waited = min(timeout, APPEAR)
             break
         time.sleep(max(0.0, min(RETRY_AFTER, deadline - time.monotonic())))
-    raise _no_answer(session, key, timeout if late else min(timeout, APPEAR), late)
+    raise _no_answer(session, key, waited, late)
 
 
 @lru_cache(maxsize=CACHED_CALLERS)
