@@ -20,7 +20,7 @@ LOOK = 2.0
 MOST_SKIPPED, MOST_INCOMPLETE, MOST_REFUSED = 0.02, 0.1, 0.02
 """A machine keeps a rate if at most these shares of the cycles are skipped or lack an answer, and of the commands are
 refused because they come too late. Drives and sensors tolerate some missed cycles, and a story with 17 % of them was
-played without harm; a machine that is fast enough misses none."""
+green; a machine that is fast enough misses none."""
 HALVINGS = 2
 """The rate is halved at most this often: commands need at least a quarter of 200 Hz."""
 FEW_CORES, CALM_RATE, RATE_WITH_PAGE = 2, 100.0, 50.0
@@ -79,7 +79,7 @@ class CycleCounts:
     def __str__(self) -> str:
         return (
             f"{self.skipped} of {self.cycles + self.skipped} cycles were skipped and {self.incomplete} incomplete, "
-            f"99 of 100 began within {1e3 * self.late:.1f} ms, {self.refused} of {self.commands} commands came too late"
+            f"99 of 100 began within {1e3 * self.late:.1f} ms, {self.refused} of {self.commands} commands were refused"
         )
 
 

@@ -54,7 +54,7 @@ def test_the_pace_is_what_happened_between_two_statuses() -> None:
     found = count_cycles(client, until)  # type: ignore[arg-type]
     assert found == CycleCounts(200.0, cycles=790, skipped=10, incomplete=3, late=0.0031, commands=396, refused=1)
     assert found.is_kept
-    cycles, commands = "10 of 800 cycles were skipped and 3 incomplete", "1 of 396 commands came too late"
+    cycles, commands = "10 of 800 cycles were skipped and 3 incomplete", "1 of 396 commands were refused"
     assert str(found) == f"{cycles}, 99 of 100 began within 3.1 ms, {commands}"
 
 
