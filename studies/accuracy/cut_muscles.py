@@ -6,7 +6,7 @@ The model is that of `studies.accuracy.lies`; it has seen no cut. Each seed is o
 muscle, whose wire is cut after 40 s. The arm goes on moving as commanded for 8 s: with a muscle less it leaves the
 postures and tensions that were learned. Right are the sensors of the joints and of all other muscles; tension and
 length of the cut one contradict them. The robot of the demo stops when the first of these is hidden. With `--rests` the
-arm rests since this time [s] before the cut.
+arm gets no new command from this time [s] before the cut on, and comes to rest.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def recording(robot: RobotConfig, muscle: str, seed: int, rests: float | None) -
         robot: The robot.
         muscle: The muscle that is cut.
         seed: Seed of the motion.
-        rests: The arm rests since this time [s] before the cut; None if it moves.
+        rests: The arm gets no new command from this time [s] before the cut on; None if it goes on moving.
     """
     file = CACHE / f"{muscle}_{seed}{'' if rests is None else f'_{rests:g}'}.pkl"
     if not file.exists():
@@ -81,7 +81,7 @@ def _right(names: set[str], muscle: str) -> set[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--rests", type=float)
+    parser.add_argument("--rests", type=float, help="time [s] before the cut without a new command")
     arguments = parser.parse_args()
     robot, schema = load_robot(Path("robots/musashi_arm.yaml")), body_of("musashi_arm").schema
     table = Table("muscle", "noticed", "median", "right sensor hidden at first", "right sensor hidden within 8 s")

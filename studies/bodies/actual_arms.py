@@ -24,7 +24,7 @@ def motion(
 ) -> Iterator[Mapping[str, np.ndarray]]:
     """Yield samples [unit] at a rate [Hz] of random motion that lasts `duration` [s of the arm's time].
 
-    From the time `rests_at` [s] on the arm rests where it is commanded to be then.
+    From the time `rests_at` [s] on the arm gets no new command, and comes to rest.
     """
     playground = DirectPlayground(body, rate)
     for command, hold in registry.load_object(robot.collect["motion"])(robot, seed):

@@ -107,7 +107,7 @@ def test_what_is_no_arm_is_refused_in_a_sentence(tmp_path, text, report):
 
 @pytest.mark.parametrize("declared", ["", "xmlns:drake='http://drake.mit.edu'"])
 def test_extensions_of_other_programs_are_left_out(tmp_path, declared):
-    """Nobody declares their prefix; an empty line before the declaration is no XML either, and ROS reads both."""
+    """Files do not declare their prefix; an empty line before the XML declaration is usual too. ROS reads both."""
     text = ARM.replace("<limit lower", "<limit drake:acceleration='9' lower").replace("<robot", f"<robot {declared}", 1)
     text = text.replace("</robot>", "<drake:joint name='a'><link name='b'/></drake:joint></robot>")
     draft = describe(written(tmp_path, f'\n<?xml version="1.0"?>\n{text}'), None, None, tmp_path)
