@@ -24,7 +24,7 @@ from link import Link, missing
 from stack import Stack
 
 FRESH_WITHIN = 1.0
-TOLD_WITHIN = 1.5
+REPORTED_WITHIN = 1.5
 VIEWERS_WITHIN = 1.0
 SETTLE = 0.3
 """The ramp of a set-point that comes to rest in `hold` takes less [s]."""
@@ -118,12 +118,12 @@ def estimated(hal: list[list[Any]], model: list[list[Any]], times: Times) -> dic
 
 
 def report(client: list[list[Any]], service: str, times: Times) -> tuple[float, float]:
-    """How soon a client was told that a service is gone, and that it is there again; infinite if never."""
+    """Return how soon a client saw that a service is gone, and that it is there again; infinite if never."""
     news = [(row[1], row[3]) for row in client if row[0] == "alive" and row[2] == service]
     gone = min((at - times.broken for at, is_there in news if not is_there and at >= times.broken), default=math.inf)
     there = min((at - times.mended for at, is_there in news if is_there and at >= times.mended), default=math.inf)
     if math.isinf(there) and any(is_there and times.broken < at < times.mended for at, is_there in news):
-        there = 0.0  # a process that starts anew is told before its first cycle
+        there = 0.0  # a process that starts anew is reported before its first cycle
     return gone, there
 
 
@@ -139,7 +139,7 @@ def judged(case: Case, seen: dict[str, Any]) -> list[str]:
         wrong.append("a command older than its time to live was followed")
     if seen["oldest_measured"] > 2 * seesaw.STALE:
         wrong.append("something stale was called measured")
-    if seen["fresh"] > (TOLD_WITHIN + FRESH_WITHIN if case.is_killed else FRESH_WITHIN):
+    if seen["fresh"] > (REPORTED_WITHIN + FRESH_WITHIN if case.is_killed else FRESH_WITHIN):
         wrong.append("estimates not fresh in time")
     if seen["revived"]:
         wrong.append("it moved again by itself after it had stopped")
@@ -147,7 +147,7 @@ def judged(case: Case, seen: dict[str, Any]) -> list[str]:
         wrong.append("it moved without a command")
     if case.is_untouched and seen["not_following"] > 0:
         wrong.append("the control path was touched")
-    if case.gone and max(seen["gone"], seen["there"]) > TOLD_WITHIN:
+    if case.gone and max(seen["gone"], seen["there"]) > REPORTED_WITHIN:
         wrong.append("liveliness late")
     if case.viewers and seen["viewers"] > VIEWERS_WITHIN:
         wrong.append("viewers not back in time")
@@ -158,7 +158,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     """One line per case, the worst of its runs; times in ms."""
     lines = [
         "| fault | runs | oldest command followed | not followed | estimates fresh after | oldest called measured | "
-        "told gone / there after | viewers after | longest HAL cycle | bare timer late | not met |",
+        "reported gone / there after | viewers after | longest HAL cycle | bare timer late | not met |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(row["case"] for row in rows):
@@ -185,7 +185,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def tried(stack: Stack, case: Case, number: int) -> dict[str, Any]:
-    """As `run`; what could not be tried is told as such."""
+    """As `run`; what could not be tried gets a row that says so."""
     try:
         return run(stack, case, number)
     except RuntimeError as error:
@@ -204,12 +204,14 @@ def main() -> int:
     if why := missing():
         print(f"skipped: {why}")
         return 0
-    found: dict[str, Any] = {}
+    if chosen.json:
+        chosen.json.parent.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {}
     cases = [case for case in CASES if any(word in case.name for word in chosen.only)]
     with tempfile.TemporaryDirectory(prefix="network") as temporary:
         folder = chosen.folder or Path(temporary)
         for protocol in chosen.protocols:
-            rows = found[protocol] = []
+            rows = results[protocol] = []
             with Link() as link, Stack(folder / protocol, link, protocol) as stack:
                 for number in range(chosen.runs):
                     for case in cases:
@@ -218,10 +220,10 @@ def main() -> int:
                             json.dumps({"protocol": protocol, "load": os.getloadavg()[0], **rows[-1]}), file=sys.stderr
                         )
                         if chosen.json:
-                            chosen.json.write_text(json.dumps(found, indent=1))
-    for protocol, rows in found.items():
+                            chosen.json.write_text(json.dumps(results, indent=1))
+    for protocol, rows in results.items():
         print(f"\n{protocol}, load {os.getloadavg()[0]:.0f}; the worst of the runs, in ms\n\n{table(rows)}")
-    return int(any(row["wrong"] for rows in found.values() for row in rows))
+    return int(any(row["wrong"] for rows in results.values() for row in rows))
 
 
 if __name__ == "__main__":

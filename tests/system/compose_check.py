@@ -198,6 +198,7 @@ def main() -> int:
         if not options.running:
             docker("compose", "down", "--volumes", "--timeout", "20")
     if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(figures, indent=1) + "\n")
     print("All containers came back, and no motor came on by itself.")
     return 0
