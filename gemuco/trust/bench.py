@@ -11,13 +11,16 @@ from gemuco.trust.alternatives import Alternatives, is_another
 from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
-from gemuco.trust.healthy import Healthy
+from gemuco.trust.healthy import PRIOR, Healthy
 from gemuco.trust.hypotheses import SEARCHED
 from gemuco.trust.jumps import EARLIER, TOGETHER, moved_alone
 from gemuco.trust.recent import Recent, View
 from gemuco.trust.relations import Relations
 from gemuco.trust.tool import JudgedTool
 
+WAITS = 100
+"""Steps are learned as healthy after this number of blocks, unless something is hidden until then: a lie that is not
+noticed at once would raise the limits above itself. They are at once at the start, and outside of what was learned."""
 LATELY = 10
 """An alarm is new within this number of blocks after the change that caused it."""
 OUTSIDE = 1.8
@@ -61,6 +64,8 @@ class Bench:
         self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
         self.place = {int(position): column for column, position in enumerate(relations.columns)}
         self.environment = frozenset(range(relations.count, size))
+        self._steps: deque[np.ndarray] = deque()
+        """What `Healthy.add_steps` will learn, oldest first."""
         self.refresh()
 
     def refresh(self) -> None:
@@ -109,14 +114,19 @@ class Bench:
         if before is not None and before.hidden - hidden:
             self.recent.unsettle()  # one that returns may have lied when the body settled
         view = self.view = self.shown(hidden)
+        if before is not None and hidden - before.hidden - self.recent.missing():
+            self._steps.clear()
         if before is None or before.hidden != hidden:
             self.lasting = LastingTest(len(self.relations.columns))
             view = self.view = self._compared(view, before, since)
         outside = self.relations.outside(self.schema, self.recent.values()[-1:], view.z[-1:] * view.healthy[-1:])
         self._outside.append(bool(outside > OUTSIDE) and not self.relations.is_linear)
         self.recent.find_repeats(view, self.judge.scale, motion)
-        looks = 0.0 if self.recent.resting else motion  # at rest sensor noise is no motion
-        self.lasting.add(view.standard(self.judge.scale)[-1], self.judge.least, looks / self.judge.time)
+        is_blind = bool(self.recent.resting) or self._outside[-1]  # at rest sensor noise is no motion
+        looks = 0.0 if is_blind else motion
+        predicted = self.recent.values()[-1] - view.z[-1] * view.healthy[-1]
+        predicted[list(self.environment)] = 0.0  # p has no gain
+        self.lasting.add(view.standard(self.judge.scale)[-1], predicted, self.judge.least, looks / self.judge.time)
         return self.judge(view, self.lasting)
 
     def _compared(self, view: View, before: View | None, since: int) -> View:
@@ -207,3 +217,7 @@ class Bench:
         late = None if self._outside[-1] else view.late  # errors of a model out there are of any sign
         if np.isfinite(z[-1]).any():
             self.healthy.add(z, evidence.step, noise, motion, late, self.recent.lag)
+            self._steps.append(np.where(np.isfinite(z[-1]), evidence.step, np.nan))
+        is_learning = self.healthy.count < PRIOR or any(self._outside)
+        while len(self._steps) > (0 if is_learning else WAITS):
+            self.healthy.add_steps(self._steps.popleft())

@@ -16,6 +16,8 @@ LONGEST = AGES[-1]
 """A test looks at this number of the newest blocks."""
 MOST = 6.0
 """One independent look adds at most this much to the sum: a healthy body is far off now and then, at a rare posture."""
+FURTHEST = 2.0
+"""A prediction counts as at most this far from the mean of its signal [standard deviations]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,25 +107,28 @@ class StepTest:
 
 
 class LastingTest:
-    """Cumulative sum: how likely it is that an element has been off, one way, by at least the size that matters.
+    """Cumulative sums: how likely it is that an element has been off by at least the size that matters.
 
-    A robot at rest shows the same error again and again, so the sum grows with motion and not with time.
+    Either it has been off one way, or in proportion to its prediction: errors of a wrong gain or sign change their sign
+    with it. A robot at rest shows the same error again and again, so the sums grow with motion and not with time.
     """
 
     def __init__(self, size: int) -> None:
-        self.sums = np.zeros((2, size))
+        self.sums = np.zeros((4, size))
 
-    def add(self, z: np.ndarray, least: np.ndarray, looks: np.ndarray) -> None:
+    def add(self, z: np.ndarray, predicted: np.ndarray, least: np.ndarray, looks: np.ndarray) -> None:
         """Add one block.
 
         Args:
             z: Errors [their standard deviations], shape (n,); NaN where missing.
+            predicted: Predictions of the others [standard deviations of the signal], shape (n,); NaN where missing.
             least: Size that matters [their standard deviations], shape (n,).
             looks: Number of independent looks that this block is worth, at most 1, shape (n,).
         """
-        for row, sign in enumerate((1.0, -1.0)):
-            gain = np.clip(least * np.nan_to_num(sign * z) - 0.5 * least**2, -MOST, MOST) * looks
-            self.sums[row] = np.maximum(0.0, self.sums[row] + gain)
+        line = np.clip(np.nan_to_num(predicted), -FURTHEST, FURTHEST)
+        ways = np.stack([np.ones(len(z)), -np.ones(len(z)), line, -line]) * least
+        gain = np.clip(ways * np.nan_to_num(z) - 0.5 * ways**2, -MOST, MOST) * looks
+        self.sums = np.maximum(0.0, self.sums + gain)
 
     @property
     def likelihood(self) -> np.ndarray:

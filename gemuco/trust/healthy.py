@@ -98,15 +98,22 @@ class Healthy:
             mean, product = getattr(self, name), now * z[-1 - apart] / self._square
             product = np.where(np.isfinite(product), np.clip(product, -4.0, 4.0), mean)
             setattr(self, name, mean + share * (product - mean))
-        above, fade = is_new & (steps > COMMON), 1.0 - 1.0 / TAIL_MEMORY
-        self._excess = self._excess * fade + np.where(above, steps - COMMON, 0.0)
-        self._exceeding = self._exceeding * fade + above
         is_noise = np.isfinite(noise)
         weight = is_noise * np.array([[1.0 - motion], [motion]])
         self._noise_count += weight
         share = weight / np.clip(self._noise_count, 1.0, MEMORY)
         change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
         self._noise += share * (change - self._noise)
+
+    def add_steps(self, steps: np.ndarray) -> None:
+        """Learn how large steps usually are from one block.
+
+        Args:
+            steps: Result of the step test, shape (n,); NaN where the newest error is missing.
+        """
+        above, fade = steps > COMMON, 1.0 - 1.0 / TAIL_MEMORY
+        self._excess = self._excess * fade + np.where(above, steps - COMMON, 0.0)
+        self._exceeding = self._exceeding * fade + above
 
     def _learn_lateness(self, now: np.ndarray, late: np.ndarray, lag: np.ndarray) -> None:
         """Learn how late each signal usually is, and how far values are apart in time beyond it; see `add`.

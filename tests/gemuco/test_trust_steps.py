@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gemuco.trust.changes import AGES, FAINT, LONGEST, Likeness, StepTest
+from gemuco.trust.changes import AGES, FAINT, LONGEST, LastingTest, Likeness, StepTest
 from gemuco.trust.evidence import Judge, burst
 from gemuco.trust.healthy import NOISE_KNOWN, Healthy
 from gemuco.trust.recent import NOISY, View, _noise
@@ -26,6 +26,17 @@ def test_a_step_is_tested_with_its_likeness():
     expected = np.sqrt(step @ np.linalg.inv(covariance) @ step)
     assert found[0] == pytest.approx(expected, rel=1e-6)
     assert (1, 2, 3, 5)[age[0]] == 5
+
+
+@pytest.mark.parametrize(("gain", "is_wrong"), [(-2.0, True), (0.6, True), (0.0, False)])
+def test_errors_that_change_their_sign_with_the_prediction_add_up(gain, is_wrong):
+    """A reversed sign or a wrong gain is wrong both ways in turn; sums of one way only forget it at each turn."""
+    random, test = np.random.default_rng(5), LastingTest(1)
+    for block in range(200):
+        predicted = np.array([1.2 * np.sin(0.15 * block)])
+        z = gain * predicted / 0.2 + random.normal(size=1)
+        test.add(z, predicted, np.full(1, 3.0), np.full(1, 0.2))
+    assert (test.likelihood[0] > 25.0) == is_wrong
 
 
 @pytest.mark.parametrize(("first", "last"), [(0, LONGEST - 3), (5, 20), (LONGEST - 4, LONGEST - 1)])

@@ -126,6 +126,7 @@ def test_an_alarm_that_was_none_is_raised_later_again_and_a_plain_lie_teaches_no
     for block in range(36_000):  # its usual steps are a little too large once in six seconds
         steps = np.full(3, 3.4 if block % 60 == 0 else 1.0)
         healthy.add(np.zeros((LONGEST, 3)), steps, np.zeros(3), 1.0)
+        healthy.add_steps(steps)
     assert healthy.caution < 0.4 * MOST_CAREFUL
     assert healthy.limit(CHANCE)[1] < 1.1 * before[1]
 
