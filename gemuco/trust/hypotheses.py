@@ -25,9 +25,6 @@ ALIKE = 6.0
 """Two columns look alike if their logarithms of the likelihood ratio differ by less than this."""
 CLOSE = 0.8
 """Nor if the smaller is more than this share of the larger."""
-SILENT = 0.35
-"""And if without the one with less evidence less than this share of an alarm is left: then nothing speaks against the
-other one any more."""
 MOST = 3
 """At most this number of columns is named as alternatives."""
 AGREES = 0.6
@@ -133,7 +130,7 @@ def explain(
     if part and not (part | sudden).intersection(single):
         return Cause(part, "part", max(part, key=lambda c: evidence.strength[c]))
     if single:
-        alike = [c for c in single if _is_alike(best, float(evidence.strength[c])) or left(frozenset({c})) < SILENT]
+        alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
         if len(alike) == 1:
             return Cause(frozenset(alike), "element", alike[0])
         return Cause(frozenset(alike[:MOST]), "either", alike[0])

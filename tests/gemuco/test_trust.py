@@ -317,7 +317,7 @@ def test_what_is_outside_of_the_learned_range_contradicts_no_other(beyond, accus
     whole = Evidence(ratio, strength, np.full(12, 5), np.zeros(12), np.zeros(12, bool), np.zeros(12, bool), 1.0)
 
     def without(columns):
-        return whole if columns.isdisjoint({JOINT, TENSION}) else replace(whole, ratio=0.45 * ratio)
+        return whole if columns.isdisjoint({JOINT, TENSION}) else replace(whole, ratio=0.3 * ratio)
 
     cause = explain(whole, without, (), (), frozenset(), beyond=frozenset(beyond))
     assert (cause.cause, cause.columns) == ("element", frozenset({accused}))
