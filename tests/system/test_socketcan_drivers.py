@@ -189,6 +189,7 @@ def test_a_frozen_node_process_is_silent_and_not_believed(master, nodes):
     assert master.robot.mode != "hold", "nothing enables itself"
 
 
+@NEEDS_CAN_UTILS
 def test_frames_of_all_lengths_and_kinds_from_a_stranger(master):
     malformed = master.device("biceps_cell")["counters"]["malformed"]
     lines = ["18B#", "18B#01", "18B#0102030405060708", "70B#", "08B#01", "58B#00", "000#", "18B#R", "0000018B#0102"]
