@@ -124,7 +124,7 @@ class Bench:
         self.recent.find_repeats(view, self.judge.scale, motion)
         is_blind = bool(self.recent.resting) or self._outside[-1]  # at rest sensor noise is no motion
         looks = 0.0 if is_blind else motion
-        predicted = self.recent.values()[-1] - view.z[-1] * view.healthy[-1]
+        predicted = self.recent.predicted(view)
         predicted[list(self.environment)] = 0.0  # p has no gain
         self.lasting.add(view.standard(self.judge.scale)[-1], predicted, self.judge.least, looks / self.judge.time)
         return self.judge(view, self.lasting)
@@ -218,6 +218,6 @@ class Bench:
         if np.isfinite(z[-1]).any():
             self.healthy.add(z, evidence.step, noise, motion, late, self.recent.lag)
             self._steps.append(np.where(np.isfinite(z[-1]), evidence.step, np.nan))
-        is_learning = self.healthy.count < PRIOR or any(self._outside)
-        while len(self._steps) > (0 if is_learning else WAITS):
+        is_at_once = self.healthy.count < PRIOR or any(self._outside)
+        while len(self._steps) > (0 if is_at_once else WAITS):
             self.healthy.add_steps(self._steps.popleft())

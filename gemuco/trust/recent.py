@@ -308,9 +308,11 @@ class Recent:
             motion: Motion in the newest block [looks at a new posture].
         """
         used = slice(self._samples.shape[1])
-        healthy = view.healthy[-1][used]
-        predicted = self.blocks[-1].mean[used] - view.z[-1][used] * healthy
-        self.repeats.add(self._samples, motion, predicted, healthy * scale[used])
+        self.repeats.add(self._samples, motion, self.predicted(view)[used], (view.healthy[-1] * scale)[used])
+
+    def predicted(self, view: View) -> np.ndarray:
+        """Return what the others predict of each column in the newest block [standard deviations], shape (columns,)."""
+        return np.asarray(self.blocks[-1].mean - view.z[-1] * view.healthy[-1])
 
     def _errors_when_settled(self, relations: Relations, hidden: Hidden, used: np.ndarray) -> np.ndarray:
         """Return `View.settled`; `used` are the columns that are not hidden."""
