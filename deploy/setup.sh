@@ -34,13 +34,18 @@ if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; 
     torch="$bin/python -m pip --disable-pip-version-check install $compile --constraint constraints.txt torch"
     $torch --no-deps &
     beside=$!
-    trap 'kill $beside 2>/dev/null || :' EXIT # a process in the background does not see Ctrl-C
+    compiler=
+    trap 'kill $beside $compiler 2>/dev/null || :' EXIT # a process in the background does not see Ctrl-C
     trap 'exit 130' INT TERM
 fi
 if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install $kept --python $bin/python $how --requirement build/wanted.txt; }; then
     echo "uv did not install; pip does it, which takes longer."
     pip install $how --requirement build/wanted.txt
 fi
-wait
-[ -z "$torch" ] || $torch # now with what it needs, if that is not there yet
+if [ -n "$torch" ]; then # gemuco is compiled at its first start, which takes a minute, without torch: what is done meanwhile is kept
+    nice "$bin/python" -m gemuco.warm >build/warm.log 2>&1 &
+    compiler=$!
+    wait $beside || :
+    $torch # now with what it needs, if that is not there yet
+fi
 pip install --quiet --no-deps --no-build-isolation --editable .
