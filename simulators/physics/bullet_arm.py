@@ -23,7 +23,6 @@ class BulletArm:
     Attributes:
         position: Joint positions [rad], shape (n,); updated in place by every step.
         effort: Torque of every motor in the last step [N m], shape (n,); updated in place.
-        pairs: Number of pairs of links that can collide.
     """
 
     def __init__(self, text: str, joints: Sequence[str], position: np.ndarray, efforts: np.ndarray) -> None:
@@ -58,8 +57,8 @@ class BulletArm:
                 self._body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client
             )
         self.place(self.position)
-        self.pairs = self._allow_contacts()
-        self._add_floor()
+        self._pairs = self._allow_contacts()
+        self._floor = self._add_floor()
 
     @property
     def _count(self) -> int:
@@ -92,6 +91,15 @@ class BulletArm:
         self.place(position)
         pybullet.performCollisionDetection(**self._options)
         return any(contact[8] < 0.0 for contact in pybullet.getContactPoints(**self._options))
+
+    def distance(self, position: np.ndarray, most: float) -> float:
+        """Return the smallest distance between what can touch [m], at most `most`; negative where shapes overlap."""
+        self.place(position)
+        client, body, floor = self._options, self._body, self._floor
+        near = [pybullet.getClosestPoints(body, body, most, one, other, **client) for one, other in self._pairs]
+        if floor is not None:
+            near += [pybullet.getClosestPoints(body, floor, most, link, **client) for link in range(self._count)]
+        return min((float(point[8]) for points in near for point in points), default=most)
 
     def torques(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques that hold the arm [N m] at joint positions [rad], and the inertia of every joint [kg m2].
@@ -126,32 +134,33 @@ class BulletArm:
                 yield link
             link = infos[link][16]
 
-    def _allow_contacts(self) -> int:
-        """Let links collide that do not touch now and are not neighbours; return the number of pairs."""
+    def _allow_contacts(self) -> list[tuple[int, int]]:
+        """Let links collide that do not touch now and are not neighbours; return their pairs."""
         client, count = self._options, self._count
         parents = {index: pybullet.getJointInfo(self._body, index, **client)[16] for index in range(count)}
-        allowed = 0
+        allowed = []
         for one, other in itertools.combinations(range(-1, count), 2):
             near = parents.get(other) == one or parents.get(one) == other or parents.get(parents.get(other, -1)) == one
             touching = near or pybullet.getClosestPoints(
                 self._body, self._body, 0.0, linkIndexA=one, linkIndexB=other, **client
             )
             pybullet.setCollisionFilterPair(self._body, self._body, one, other, 0 if touching else 1, **client)
-            allowed += not touching
+            if not touching:
+                allowed.append((one, other))
         return allowed
 
-    def _add_floor(self) -> None:
-        """Add a floor below the links that stand still, if they have a shape, and below the arm as it is now."""
+    def _add_floor(self) -> int | None:
+        """Add a floor below the links that stand still, if they have a shape, and below the arm; return its number."""
         shaped = [
             link for link in range(-1, self._count) if pybullet.getCollisionShapeData(self._body, link, **self._options)
         ]
         if -1 not in shaped:
-            return
+            return None
         lowest = min(pybullet.getAABB(self._body, link, **self._options)[0][2] for link in shaped)
         half = [50.0, 50.0, 0.5]
         box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._options)
         place = [0.0, 0.0, lowest - FLOOR - half[2]]
-        pybullet.createMultiBody(0.0, box, basePosition=place, **self._options)
+        return int(pybullet.createMultiBody(0.0, box, basePosition=place, **self._options))
 
     def close(self) -> None:
         """Disconnect the physics client. Safe to call twice."""

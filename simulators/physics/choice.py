@@ -60,12 +60,10 @@ class ServoArm(Protocol):
     Attributes:
         position: Joint positions [rad], shape (n,); updated in place by every step.
         effort: Torque of every motor in the last step [N m], shape (n,); updated in place.
-        pairs: Number of pairs of links that can collide.
     """
 
     position: np.ndarray
     effort: np.ndarray
-    pairs: int
 
     def place(self, position: np.ndarray) -> None:
         """Put the joints at `position` [rad], shape (n,), at rest."""
@@ -81,6 +79,13 @@ class ServoArm(Protocol):
 
     def touches(self, position: np.ndarray) -> bool:
         """Whether links touch one another or the floor at joint positions [rad], shape (n,), where the arm is put."""
+        ...
+
+    def distance(self, position: np.ndarray, most: float) -> float:
+        """Return the smallest distance between what can touch [m], at most `most`; negative where shapes overlap.
+
+        The arm is put at joint positions [rad], shape (n,).
+        """
         ...
 
     def torques(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,6 @@ class MujocoArm:
     Attributes:
         position: Joint positions [rad], shape (n,); updated in place by every step.
         effort: Torque of every motor in the last step [N m], shape (n,); updated in place.
-        pairs: Number of pairs of links that can collide.
     """
 
     def __init__(self, text: str, joints: Sequence[str], position: np.ndarray, efforts: np.ndarray) -> None:
@@ -41,8 +40,6 @@ class MujocoArm:
                 name=PLANE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[50.0, 50.0, 1.0], pos=[0.0, 0.0, low - FLOOR]
             )
         self._load(spec, joints)
-        count = self._model.nbody
-        self.pairs = count * (count - 1) // 2 - len(touching)
 
     def _load(self, spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
         self._model = spec.compile()
@@ -105,6 +102,13 @@ class MujocoArm:
         """Whether links touch one another or the floor at joint positions [rad], shape (n,), where the arm is put."""
         self.place(position)
         return bool((self._data.contact.dist[: self._data.ncon] < 0.0).any())
+
+    def distance(self, position: np.ndarray, most: float) -> float:
+        """Return the smallest distance between what can touch [m], at most `most`; negative where shapes overlap."""
+        self._model.geom_margin[:] = most
+        self.place(position)
+        self._model.geom_margin[:] = 0.0
+        return float(np.min(self._data.contact.dist[: self._data.ncon], initial=most))
 
     def torques(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques that hold the arm [N m] at joint positions [rad], and the inertia of every joint [kg m2].

@@ -131,6 +131,9 @@ def test_an_arm_of_a_urdf_carries_touches_and_follows_alike(both, tmp_path):
         for ours, theirs in zip(bullet.torques(posture), mujoco.torques(posture), strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-4)
         assert bullet.touches(posture) == mujoco.touches(posture)
+        apart = bullet.distance(posture, 0.2)
+        assert apart == pytest.approx(mujoco.distance(posture, 0.2), abs=2e-3)
+        assert (apart < 0.0) is bullet.touches(posture)
     for body in (bullet, mujoco):
         body.place(np.zeros(3))
     for number in range(400):

@@ -1,5 +1,6 @@
 """Any URDF: which arm is in it, what cannot be used, and how the arm moves, weighs and touches."""
 
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hal.errors import ConfigError
 from hal.finding.doctor import Severity, check_file
 from simulators.bullet import pybullet
 from simulators.physics.bullet_arm import BulletArm
-from simulators.robots.urdf_arm import describe, simulator
+from simulators.robots.urdf_arm import describe, random_motion, simulator
 from simulators.robots.urdf_arm.body_file import find_mesh, physics_urdf, possible
 from simulators.robots.urdf_arm.choice import arm_of, choose_arm
 from simulators.robots.urdf_arm.kinematics import TipKinematics
@@ -62,14 +63,18 @@ def arm(tmp_path):
     return choose_arm(read_tree(written(tmp_path)))
 
 
+def drafted(folder, text=ARM):
+    draft = describe(written(folder, text), None, None, folder)
+    (folder / "eds").mkdir()
+    for sheet in draft.sheets:
+        (folder / "eds" / sheet.name).write_text(sheet.read_text())
+    (folder / "arm.yaml").write_text(draft.text)
+    return load_robot(folder / "arm.yaml")
+
+
 @pytest.fixture
 def robot(tmp_path):
-    draft = describe(written(tmp_path), None, None, tmp_path)
-    (tmp_path / "eds").mkdir()
-    for sheet in draft.sheets:
-        (tmp_path / "eds" / sheet.name).write_text(sheet.read_text())
-    (tmp_path / "arm.yaml").write_text(draft.text)
-    return load_robot(tmp_path / "arm.yaml")
+    return drafted(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -264,6 +269,41 @@ def test_a_mass_that_no_body_has_is_made_possible():
     np.testing.assert_allclose(possible(right), right)
 
 
+def test_servos_that_meet_in_a_point_hold_the_head_behind_them(tmp_path):
+    """The ball joints of a Stewart platform are drawn as three joints each, with frames of a nanogram between them."""
+    weights = dict.fromkeys(("roll", "pitch", "roll2", "pitch2"), (1e-9, 1e-9)) | {"rod": (5e-3, 2e-6)}
+    names = ["base", "roll", "pitch", "rod", "roll2", "pitch2", "head"]
+    links = [link("base", 1.0), link("head", 0.3), link("tip")]
+    for name, (mass, moment) in weights.items():
+        inertia = "".join(f"{key}='{moment}' " for key in ("ixx", "iyy", "izz"))
+        links.append(f"<link name='{name}'><inertial><mass value='{mass}'/><inertia {inertia}/></inertial></link>")
+    axes = ("1 0 0", "0 1 0", "0 0 1") * 2
+    joints = [
+        joint(name, "revolute", *pair, axis=axis)
+        for name, pair, axis in zip(names[1:], pairwise(names), axes, strict=True)
+    ]
+    joints.append(joint("end", "fixed", "head", "tip", 'xyz="0.1 0 0"'))
+    arm = choose_arm(read_tree(written(tmp_path, f"<robot>{''.join(links + joints)}</robot>")))
+    text, _ = physics_urdf(arm)
+    body = BulletArm(text, arm.names, np.array([0.4, -0.6, 0.5, 0.7, -0.3, 0.2]), np.full(6, 1.0))
+    middle = body.position.copy()
+    for number in range(400):
+        goal = middle + 0.1 * np.sin(0.02 * number)
+        body.step(goal)
+        assert np.abs(body.position - goal).max() < 0.05
+    body.close()
+
+
+def test_motors_have_the_torque_of_the_file(tmp_path):
+    """A joint that needs little torque at rest carries what the others accelerate."""
+    for effort in (60.0, 10.0, 0.0):
+        folder = tmp_path / f"{effort:g}"
+        folder.mkdir()
+        world = simulator.world(drafted(folder, ARM.replace('effort="60"', f'effort="{effort}"')), "nominal", 0)
+        assert world._physics._efforts == pytest.approx(np.maximum(2.0 * world._needed, effort))
+        world.close()
+
+
 def test_links_without_mass_get_one_and_are_named(tmp_path):
     text = ARM.replace(link("fore", 1.0, BOX), link("fore", 0.0, BOX, "<visual/>"))
     _, notes = physics_urdf(choose_arm(read_tree(written(tmp_path, text))))
@@ -322,6 +362,16 @@ def test_postures_and_moves_touch_nothing(robot):
         assert not body._physics.touches(posture)
     postures.close()
     body.close()
+
+
+def test_moves_keep_a_distance_from_the_floor(tmp_path):
+    """The elbow is 0.2 m above a floor that it can reach."""
+    robot = drafted(tmp_path, ARM.replace('xyz="0 0 0.5"', 'xyz="0 0 0.2"').replace('rpy="0.2 0 0"', 'rpy="0 0.3 0"'))
+    reach, world = simulator.reach(robot), simulator.world(robot, "nominal", 0)
+    points = islice(random_motion(robot, 0), 1500)
+    apart = [world._physics.distance(point, 0.1) for point, _ in points]
+    assert 0.01 * reach <= min(apart) < 0.05 * reach, "it comes near the floor, and not too near"
+    world.close()
 
 
 def test_the_world_follows_its_motors_and_twists_its_gears(robot):

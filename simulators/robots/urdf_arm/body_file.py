@@ -19,6 +19,9 @@ MASSLESS = 1e-3
 """A link without an inertia and without a shape is a frame with this mass [kg]."""
 SMALLEST = 1e-6
 """Moments of inertia are at least this [kg m2], because lighter links are not stable."""
+LIGHT = 0.05
+"""The moments of a link are at least this share of the largest of those behind it: servos that meet in a link of a
+gram, as in a gimbal, do not hold the head behind it, because PyBullet solves one after the other."""
 FALLBACK = 0.5
 """A link whose only shape is a mesh has this mass [kg] if the file states none."""
 
@@ -54,10 +57,13 @@ class Lump:
         """Centre of mass [m], shape (3,)."""
         return self.moment / self.mass
 
-    @property
-    def central(self) -> np.ndarray:
-        """Inertia around the centre of mass [kg m2], shape (3, 3), as a body can have it."""
-        return possible(self.inertia - self.mass * _around(self.center))
+    def central(self, least: float) -> np.ndarray:
+        """Return the inertia around the centre of mass [kg m2], shape (3, 3), as a body can have it.
+
+        Args:
+            least: All moments are at least this [kg m2].
+        """
+        return possible(self.inertia - self.mass * _around(self.center), least)
 
 
 def _around(place: np.ndarray) -> np.ndarray:
@@ -65,10 +71,10 @@ def _around(place: np.ndarray) -> np.ndarray:
     return inertia
 
 
-def possible(inertia: np.ndarray) -> np.ndarray:
-    """Return the nearest inertia that a body can have, shape (3, 3)."""
+def possible(inertia: np.ndarray, least: float = SMALLEST) -> np.ndarray:
+    """Return the nearest inertia that a body can have, shape (3, 3), all of its moments at least `least` [kg m2]."""
     moments, axes = np.linalg.eigh(inertia)
-    moments = np.maximum(moments, max(SMALLEST, 0.01 * moments[2]))
+    moments = np.maximum(moments, max(least, 0.01 * moments[2]))
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
     result: np.ndarray = (axes * moments) @ axes.T
     return result
@@ -84,15 +90,17 @@ def physics_urdf(arm: Arm, weights: Mapping[str, float] | None = None) -> tuple[
     root = Element("robot", name="arm")
     guessed: list[str] = []
     lost: list[str] = []
-    before = "base"
+    parts = []
     for name, joint, link, pose in _starts(arm):
         lump = Lump()
         for member, place in _members(arm, link):
             if not _add_inertia(lump, place, arm.tree.links[member]) and joint is not None:
                 guessed.append(member)
             lost += _add_shapes(lump, place, arm.tree.links[member], arm.tree.path)
-        own = name or "base"
-        _write_link(SubElement(root, "link", name=f"link {own}"), lump, (weights or {}).get(own, 1.0))
+        parts.append((name or "base", joint, pose, lump))
+    before = "base"
+    for (own, joint, pose, lump), inertia in zip(parts, _inertias([lump for *_, lump in parts]), strict=True):
+        _write_link(SubElement(root, "link", name=f"link {own}"), lump, inertia, (weights or {}).get(own, 1.0))
         if joint is not None:
             _write_joint(root, own, before, pose, joint.axis)
         before = own
@@ -106,6 +114,15 @@ def physics_urdf(arm: Arm, weights: Mapping[str, float] | None = None) -> tuple[
         notes.append(f"No contact of {_listed(sorted(set(lost)))}: the mesh was not found, or is not STL, OBJ or DAE.")
     ElementTree.indent(root)  # Bullet cannot read long lines
     return ElementTree.tostring(root, encoding="unicode"), notes
+
+
+def _inertias(lumps: list[Lump]) -> list[np.ndarray]:
+    """Return the inertia of each link of a chain around its centre of mass [kg m2], shapes (3, 3)."""
+    inertias, least = [], SMALLEST
+    for lump in reversed(lumps):
+        inertias.append(lump.central(least))
+        least = max(least, LIGHT * float(np.linalg.eigvalsh(inertias[-1])[-1]))
+    return inertias[::-1]
 
 
 def _listed(names: list[str]) -> str:
@@ -235,12 +252,12 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     return next((one.resolve() for one in tries if one.is_file() and one.suffix.lower() in MESHES), None)
 
 
-def _write_link(body: Element, lump: Lump, factor: float) -> None:
+def _write_link(body: Element, lump: Lump, inertia: np.ndarray, factor: float) -> None:
     inertial = SubElement(body, "inertial")
     inertial.append(origin(np.eye(3), lump.center))
     SubElement(inertial, "mass", value=repr(float(factor * lump.mass)))
     names = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-    matrix = factor * lump.central
+    matrix = factor * inertia
     SubElement(inertial, "inertia", {key: repr(float(matrix[place])) for key, place in names.items()})
     for (turn, place), shape in lump.shapes:
         collision = SubElement(body, "collision")

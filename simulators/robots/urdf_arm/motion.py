@@ -17,6 +17,9 @@ HOLD = 0.2
 """The arm rests for this time [s] in every posture."""
 CHECKED = 0.1
 """A move is checked at points that are at most this far apart [rad]."""
+CLEARANCE = 0.01
+"""A move keeps this share of the reach away from what it could touch, or half of the distance of the first posture if
+that is less: the arm follows late, and gears twist."""
 TRIES = 300
 """At most this many postures are drawn for one move."""
 
@@ -56,22 +59,28 @@ def free_postures(config: RobotConfig, seed: int) -> Iterator[np.ndarray]:
         body = make_arm(text, arm.names, neutral(arm), np.ones(low.size))
     try:
         position = 0.5 * (low + high)
+        clearance = max(0.0, 0.5 * body.distance(position, 2.0 * CLEARANCE * arm.reach))
         yield position
         while True:
-            position = _next(body, random, position, low, high)
+            position = _next(body, random, position, low, high, clearance)
             yield position
     finally:
         body.close()
 
 
 def _next(
-    body: ServoArm, random: np.random.Generator, position: np.ndarray, low: np.ndarray, high: np.ndarray
+    body: ServoArm,
+    random: np.random.Generator,
+    position: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    clearance: float,
 ) -> np.ndarray:
     for _ in range(TRIES):
         goal = random.uniform(low, high)
         count = max(2, int(np.ceil(np.abs(goal - position).max() / CHECKED)))
         points = position + np.arange(count, 0, -1)[:, None] / count * (goal - position)
-        if not any(body.touches(point) for point in points):
+        if all(body.distance(point, clearance) >= clearance for point in points):
             return goal
     raise ConfigError(
         f"None of {TRIES} random postures is reached without contact. Narrow limits.{MOTOR}, or remove <collision> of "

@@ -101,7 +101,17 @@ def survey(arm: Arm) -> Survey:
             f"The range of {', '.join(narrow)} is narrower than in the URDF: a model knows what it has seen, and a "
             "wider range needs more samples."
         )
-    return Survey(low, high, np.minimum(velocity, FASTEST), np.clip(stated, needed, most), tuple(notes))
+    return Survey(low, high, np.minimum(velocity, FASTEST), motor_torques(arm, needed), tuple(notes))
+
+
+def motor_torques(arm: Arm, needed: np.ndarray) -> np.ndarray:
+    """Return the torque of every motor [N m], shape (n,): that of the URDF, at least the needed and not far beyond it.
+
+    Args:
+        arm: The arm.
+        needed: Torques that the joints need [N m], shape (n,).
+    """
+    return np.clip([joint.effort for joint in arm.joints], needed, STRONGEST * needed)
 
 
 def _is_narrower(joint: Joint, low: float, high: float) -> bool:

@@ -14,7 +14,7 @@ from simulators.robots.urdf_arm.body import EFFORT, JOINT, MOTOR, TIP, Body, arm
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.camera import TipCamera
 from simulators.robots.urdf_arm.kinematics import TipKinematics
-from simulators.robots.urdf_arm.survey import needs, neutral
+from simulators.robots.urdf_arm.survey import motor_torques, needs, neutral
 from simulators.world import World, servo_index
 
 TWIST = 0.01
@@ -45,7 +45,7 @@ class ArmWorld(World):
         text, _ = physics_urdf(arm, dict(zip(arm.names, body.weights, strict=True)))
         self._physics = make_arm(text, arm.names, neutral(arm), np.full(middle.size, np.inf))
         self._needed = needs(self._physics, low, high)
-        self._physics.limit(2.0 * self._needed)
+        self._physics.limit(np.maximum(2.0 * self._needed, motor_torques(arm, self._needed)))
         self._physics.place(middle)
         self._twist = TWIST / self._needed
         self._effort = self._physics.torques(middle)[0]
