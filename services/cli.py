@@ -314,16 +314,14 @@ def reproduce(
     fresh: Annotated[bool, typer.Option("--fresh", help="Collect and train again, also where results exist.")] = False,
 ) -> None:
     """Run the paper's experiments on a simulated robot; print the paper's figures beside the measured ones."""
-    from rich.console import Console
-
     from hal import registry
-    from services.show import progress
+    from services.show import console, progress
 
     run = registry.load_object("studies.paper:experiment")(robot)  # by name, because studies are above services
     with progress(f"reproduce {robot}") as report:
         results = run(range(seeds), out / robot, report, fresh)
     results.save(out / robot)
-    Console().print(results.table())
+    console().print(results.table())
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 

@@ -17,6 +17,7 @@ from gemuco.warm import warm
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from hal.robot import open_robot
+from services import show
 from services.client import Client
 from services.demo import arm_story, pace, report, story, tool_story
 from services.demo.actor import Actor, NotFollowing
@@ -36,7 +37,6 @@ from services.model.living_model import load_model
 from services.model.model_config import model_config
 from services.process.supervisor import NotReady, Supervisor, gemuco_command
 from services.runtime import services_here
-from services.show import progress
 
 AFTER_SIMULATOR = {"hal", "vision"}
 """These processes look for the simulator's buses when they start."""
@@ -54,7 +54,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
         out: Folder for report, plot, recording and logs.
         with_page: Serve the page in the browser meanwhile; its link is printed first.
     """
-    console = Console()
+    console = show.console()
     started, picture = time.monotonic(), out / "story.png"
     control_of(robot)  # refuses a robot without a story before anything is made
     check_start(robot, with_page)
@@ -64,8 +64,8 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
             link = stack.enter_context(playing_along(path, out))
             console.print(f"Page: {link}  It shows the robot as soon as its processes run.", soft_wrap=True)
         make_model(robot, console)
-        with progress("compiling") as show:  # otherwise each process would wait for it
-            warm(show, has_p=trainer.has_p(robot))
+        with show.progress("compiling") as advance:  # otherwise each process would wait for it
+            warm(advance, has_p=trainer.has_p(robot))
         with Supervisor(out, at_checks=True) as supervisor:
             with running(robot, path, seed, out, supervisor, console, with_page) as cast:
                 perform(cast, seed, picture, list(supervisor.children), link)
@@ -264,13 +264,13 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         return
     console.print("No model yet: the body schema is learned from random motion of the designer's model.")
     with compiling(trainer.has_p(robot)) as compiler:
-        with progress("collecting") as show:
-            collection = collector.collect_direct(robot, None, 0, progress=show)
+        with show.progress("collecting") as advance:
+            collection = collector.collect_direct(robot, None, 0, progress=advance)
         console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
         with waiting(console, "compiling"):
             compiler.wait()
-    with progress("training") as show:
-        result = trainer.train(robot, collection.dataset, 0, show)
+    with show.progress("training") as advance:
+        result = trainer.train(robot, collection.dataset, 0, advance)
     trainer.show(result, console)
     trainer.save(result, folder)
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs.verb import RobotFile, report_errors, robot_name
+from services.verbs.verb import RobotFile, known_robot, report_errors, robot_name
 
 
 def register(app: typer.Typer) -> None:
@@ -39,3 +39,5 @@ def endpoint(
     for known in keys.SERVICES:
         state = "running" if (name, known) in running else "not running"
         typer.echo(f"{known:<10} {endpoint_of(name, known):<28} {state}")
+    if known_robot(robot) is None and name not in {other for other, _ in running}:
+        typer.echo(f"There is no robot file '{name}' here, and no service of it runs. Is the name right?", err=True)

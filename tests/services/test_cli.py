@@ -35,7 +35,10 @@ def test_every_verb_explains_itself(verb: str) -> None:
 @pytest.mark.long
 def test_the_endpoint_of_a_service_is_printed_for_programs() -> None:
     assert gemuco("endpoint", "some_arm", "hal").stdout == f"{endpoint('some_arm', 'hal')}\n"
-    whole = gemuco("endpoint", "some_arm").stdout
+    asked = gemuco("endpoint", "some_arm")
+    whole = asked.stdout
+    assert "no robot file 'some_arm' here, and no service of it runs. Is the name right?" in asked.stderr
+    assert not gemuco("endpoint", "musashi_arm").stderr
     assert [line.split()[0] for line in whole.splitlines()] == list(keys.SERVICES)
     assert endpoint("some_arm", "model") in whole and "not running" in whole
     wrong = gemuco("endpoint", "some_arm", "arm")
