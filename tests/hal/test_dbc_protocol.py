@@ -195,6 +195,33 @@ def test_a_message_whose_signals_overlap_is_refused_and_no_other(tmp_path):
         file.signal("Twice.A")
 
 
+def test_slips_that_change_no_value_are_mended(tmp_path):
+    """Names of values of a signal that is not there, also over two lines, an identifier of 29 bits without its mark."""
+    text = MIXED.replace("BO_ 2147483655 Wide", "BO_ 419364900 Wide").replace('"rpm" B', '"\xb0C" B')
+    text += 'CM_ SG_ 419364900 Count "twice VAL_ 6 No 1 ;";\nBA_DEF_ BO_ "GenMsgCycleTime" INT 0 1000;\n'
+    text += 'BA_ "GenMsgCycleTime" BO_ 419364900 20;\nSIG_VALTYPE_ 419364900 Count : 0;\n'
+    text += 'VAL_ 6 Gone 0 "OFF; or not" -1 "ON" ;\nVAL_ 6 Speed 0 "STILL"\n 1 "SLOW" ;\nVAL_ 77 Mode 0 "OFF" ;\n'
+    text += 'VAL_ 419364900 Count 3 "THREE" ;\n'
+    text += '\nBO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 A\n SG_ Lost : 0|1@1+ (1,0) [0|0] "" B\n\n'
+    text += 'VAL_ 3221225472 Lost 0 "NO" ;\n'
+    path = tmp_path / "slips.dbc"
+    path.write_bytes(text.encode("cp1252"))
+    file = dbc.load(path)
+    wide, count = file.signal("Wide.Count")
+    assert (wide.frame_id, wide.is_extended_frame, wide.cycle_time, wide.length) == (419364900, True, 20, 8)
+    assert dbc.describe(count, 3) == "three"
+    assert dbc.describe(file.signal("Bounded.Speed")[1], 1) == "slow"
+    assert dbc.describe(file.signal("Bounded.Mode")[1], 2) == "run"
+    assert file.signal("Muxed.Speed")[1].unit == "\xb0C"
+    assert {message.name for message in file.messages} == {message.name for message in load(tmp_path, MIXED).messages}
+
+
+def load(folder, text):
+    path = folder / "plain.dbc"
+    path.write_text(text)
+    return dbc.load(path)
+
+
 def test_raw_values_in_words():
     errors = dbc.load(FILES / "odrive_cansimple.dbc").signal("Heartbeat.Axis_Error")[1]
     assert dbc.describe(errors, 0, is_bits=True) == "none"
