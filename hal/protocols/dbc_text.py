@@ -18,8 +18,8 @@ _NAMED_VALUES = re.compile(r'^\s*VAL_\s+(\d+)\s+(\w+)(?:\s+-?\d+\s+"[^"]*")*\s*;
 def mended(text: str) -> str:
     """Return a text that cantools reads.
 
-    An identifier of more than 11 bits is marked as one of 29 bits, which it can only be. Names of values without a signal
-    are left out.
+    An identifier of more than 11 bits is marked as one of 29 bits, which it can only be. Names of values without a
+    signal are left out.
     """
     text = _NUMBERED.sub(lambda match: match[1] + _marked(match[2]), text)
     signals, message = set(), ""
