@@ -87,6 +87,7 @@ def robot(tmp_path):
         ("<robot><drake:a/><link name='a'", "is not XML"),
         ("<mujoco/>", "is an MJCF file of MuJoCo. `gemuco init` makes a URDF of it."),
         ("<sdf/>", "is an SDF file of Gazebo"),
+        ("<mujocoinclude/>", "is a part that another MJCF file includes, but"),
         ("<html/>", "is XML of <html>"),
         ("<robot/>", "has no link"),
         ("<robot><link name='a'/><link name='b'/></robot>", "has the links a, b without a joint to them"),

@@ -13,7 +13,11 @@ from hal.errors import ConfigError
 from hal.finding.urdf import drop_extensions, root_of
 
 TURNING = ("revolute", "continuous")
-OTHERS = {"sdf": "an SDF file of Gazebo", "COLLADA": "a COLLADA file"}
+OTHERS = {
+    "sdf": "an SDF file of Gazebo",
+    "COLLADA": "a COLLADA file",
+    "mujocoinclude": "a part that another MJCF file includes",
+}
 """Root elements of files that are taken for a URDF, and their names."""
 
 
