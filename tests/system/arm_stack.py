@@ -68,6 +68,11 @@ class Stack:
         estimate = self.client.estimate()
         return "" if estimate is None else estimate.method["joint_position"]
 
+    def is_measured(self) -> bool:
+        """Whether every element of every signal is measured, also those of drives that take longer to configure."""
+        sample = self.client.sample(timeout=0.5)
+        return sample is not None and all(bool(valid.all()) for valid in sample.valid.values())
+
     def mode(self) -> str:
         applied = self.client.applied(timeout=0.5)
         return "" if applied is None else applied.mode

@@ -140,6 +140,7 @@ def test_a_killed_process_comes_back_and_state_flows_again(stack: Stack, name: s
 
 @pytest.mark.long
 def test_a_client_gets_the_lease_after_somebody_engaged_by_a_query(stack: Stack) -> None:
+    eventually(stack.is_measured)
     engaged = ask(stack, "engage")
     assert "The controller is engaged and holds joint_position." in engaged.stdout, engaged.stderr
     eventually(lambda: stack.mode() == "follow")
