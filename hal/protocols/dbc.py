@@ -18,14 +18,12 @@ from cantools.database import Database, Message
 from cantools.database.can.signal import Signal
 
 from hal.errors import ConfigError
-from hal.protocols.dbc_text import mended
+from hal.protocols.dbc_text import decoded, mended
 
 Value = float | str
 """A number in the unit of the DBC file, or the file's name of a raw value (VAL_)."""
 Read = Callable[[bytes | bytearray], tuple[float, ...] | None]
 Unpack = Callable[[bytes | bytearray], tuple[int, ...]]
-ENCODING = "cp1252"
-"""DBC files are written in this encoding; only units, comments and names of values have other letters than ASCII."""
 LISTED = 40
 """An error lists at most this number of names."""
 
@@ -122,7 +120,7 @@ def load(path: Path) -> Dbc:
     if not path.is_file():
         raise ConfigError(f"There is no DBC file '{path}'. The path is relative to the folder of the robot file.")
     try:
-        text = mended(path.read_text(ENCODING, errors="replace"))
+        text = mended(decoded(path.read_bytes()))
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except Exception as error:  # cantools passes on every exception of its parser
         raise ConfigError(f"'{path}' is not a DBC file that cantools can read: {error}.") from error

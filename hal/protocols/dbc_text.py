@@ -15,6 +15,14 @@ _DECLARED = re.compile(r"^\s*(?:BO_\s+(\d+)\s|SG_\s+(\w+)\s)", re.MULTILINE)
 _NAMED_VALUES = re.compile(r'^\s*VAL_\s+(\d+)\s+(\w+)(?:\s+-?\d+\s+"[^"]*")*\s*;', re.MULTILINE)
 
 
+def decoded(data: bytes) -> str:
+    """Return the text of a file: DBC files are in cp1252, but many programs write UTF-8."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")
+
+
 def mended(text: str) -> str:
     """Return a text that cantools reads.
 
@@ -27,7 +35,11 @@ def mended(text: str) -> str:
         message = number or message
         if message != NO_MESSAGE:
             signals.add((message, name))
-    return _NAMED_VALUES.sub(lambda match: match[0] if match.groups() in signals else "", text)
+
+    def kept(match: re.Match[str]) -> str:  # or as many empty lines, for the numbers of lines in errors
+        return match[0] if match.groups() in signals else "\n" * match[0].count("\n")
+
+    return _NAMED_VALUES.sub(kept, text)
 
 
 def _marked(number: str) -> str:

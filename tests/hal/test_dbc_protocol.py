@@ -197,7 +197,7 @@ def test_a_message_whose_signals_overlap_is_refused_and_no_other(tmp_path):
 
 def test_slips_that_change_no_value_are_mended(tmp_path):
     """Names of values of a signal that is not there, also over two lines, an identifier of 29 bits without its mark."""
-    text = MIXED.replace("BO_ 2147483655 Wide", "BO_ 419364900 Wide").replace('"rpm" B', '"\xb0C" B')
+    text = MIXED.replace("BO_ 2147483655 Wide", "BO_ 419364900 Wide")
     text += 'CM_ SG_ 419364900 Count "twice VAL_ 6 No 1 ;";\nBA_DEF_ BO_ "GenMsgCycleTime" INT 0 1000;\n'
     text += 'BA_ "GenMsgCycleTime" BO_ 419364900 20;\nSIG_VALTYPE_ 419364900 Count : 0;\n'
     text += 'VAL_ 6 Gone 0 "OFF; or not" -1 "ON" ;\nVAL_ 6 Speed 0 "STILL"\n 1 "SLOW" ;\nVAL_ 77 Mode 0 "OFF" ;\n'
@@ -205,15 +205,27 @@ def test_slips_that_change_no_value_are_mended(tmp_path):
     text += '\nBO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 A\n SG_ Lost : 0|1@1+ (1,0) [0|0] "" B\n\n'
     text += 'VAL_ 3221225472 Lost 0 "NO" ;\n'
     path = tmp_path / "slips.dbc"
-    path.write_bytes(text.encode("cp1252"))
+    path.write_text(text)
     file = dbc.load(path)
     wide, count = file.signal("Wide.Count")
     assert (wide.frame_id, wide.is_extended_frame, wide.cycle_time, wide.length) == (419364900, True, 20, 8)
     assert dbc.describe(count, 3) == "three"
     assert dbc.describe(file.signal("Bounded.Speed")[1], 1) == "slow"
     assert dbc.describe(file.signal("Bounded.Mode")[1], 2) == "run"
-    assert file.signal("Muxed.Speed")[1].unit == "\xb0C"
     assert {message.name for message in file.messages} == {message.name for message in load(tmp_path, MIXED).messages}
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
+def test_units_have_their_letters(tmp_path, encoding):
+    path = tmp_path / "units.dbc"
+    path.write_bytes(MIXED.replace('"rpm" B', '"\xb0C" B').encode(encoding))
+    assert dbc.load(path).signal("Muxed.Speed")[1].unit == "\xb0C"
+
+
+def test_an_error_names_the_line_of_the_file(tmp_path):
+    text = MIXED + 'VAL_ 6 Gone 0 "OFF"\n 1 "ON" ;\nBO_ 12 2nd: 8 A\n'
+    with pytest.raises(ConfigError, match=f"line {text[: text.index('BO_ 12')].count(chr(10)) + 1},"):
+        load(tmp_path, text)
 
 
 def load(folder, text):
