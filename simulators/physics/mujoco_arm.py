@@ -100,8 +100,7 @@ class MujocoArm:
 
     def touches(self, position: np.ndarray) -> bool:
         """Whether links touch one another or the floor at joint positions [rad], shape (n,), where the arm is put."""
-        self.place(position)
-        return bool((self._data.contact.dist[: self._data.ncon] < 0.0).any())
+        return self.distance(position, 0.0) < 0.0
 
     def distance(self, position: np.ndarray, most: float) -> float:
         """Return the smallest distance between what can touch [m], at most `most`; negative where shapes overlap."""
