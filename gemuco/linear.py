@@ -112,6 +112,21 @@ class LinearPath:
         line[-1] += self.outputs[-1]
         return np.concatenate([line * (1.0 - share), share[None]]).astype(np.float32)
 
+    def by_all(self, gate: np.ndarray, element: int) -> np.ndarray:
+        """Return the regressions of an element of x_out on all inputs of a mask.
+
+        Args:
+            gate: See `map`.
+            element: Index of the element in x_out.
+
+        Returns:
+            Shape (parts + 1, in_size + 1): learned without each part of the data, and from all of it.
+        """
+        known = np.append(np.flatnonzero(gate), len(gate))
+        result = np.zeros((len(self.moments) + 1, len(gate) + 1))
+        result[:, known] = _chosen(self.moments[:, known[:, None], known], self._cross_of(element)[:, known])[..., 0]
+        return result
+
     def by_few(self, gate: np.ndarray, element: int) -> np.ndarray:
         """Return the regression of an element of x_out on as few inputs as do no harm, shape (in_size + 1,).
 
@@ -125,13 +140,18 @@ class LinearPath:
         """
         key = np.asarray(gate > 0).tobytes() + element.to_bytes(4)
         if key not in self._maps:
-            cross = self.cross @ self.outputs[:-1, [element]] + self.moments[:, :, -1:] * self.outputs[-1, element]
-            alone = LinearPath(self.moments, cross, np.array([[1.0], [0.0]]))
-            lines = np.stack([alone.map(kept).astype(float) for kept in (_useful(self.moments, cross, gate), gate)])
+            cross = self._cross_of(element)
+            kept = _useful(self.moments, cross, gate)
+            lines = np.stack([self.by_all(inputs, element)[-1:].T for inputs in (kept, gate)])
             few, every = _losses(self.moments, cross, np.stack([lines] * len(cross))).sum(axis=(0, 2, 3))
             is_harmful = few - every > MORE**2 * self.moments[:, -1, -1].sum()
             self._keep(key, lines[int(is_harmful), :, 0])
         return self._maps[key]
+
+    def _cross_of(self, element: int) -> np.ndarray:
+        """Return the sums of the products of x_in and 1 with an element of x_out, shape (parts, in_size + 1, 1)."""
+        line = self.outputs[:, [element]]
+        return np.asarray(self.cross @ line[:-1] + self.moments[:, :, -1:] * line[-1])
 
     def _keep(self, key: bytes, line: np.ndarray) -> None:
         if len(self._maps) >= CACHED:
@@ -142,11 +162,23 @@ class LinearPath:
         result = np.zeros(self.cross.shape[1:], np.float32)
         if not self.width:
             return result
-        moments, cross = self.moments[:, known[:, None], known], self.cross[:, known]
-        lines = _regressions(*_left_out(moments, cross))
-        best = _losses(moments, cross, lines[:-1]).sum(axis=(0, 2)).argmin(axis=0)
-        result[known] = lines[-1][best, :, np.arange(self.width)].T
+        result[known] = _chosen(self.moments[:, known[:, None], known], self.cross[:, known])[-1]
         return result
+
+
+def _chosen(moments: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Return regressions of the strength that predicts each part of the data best from the other parts.
+
+    Args:
+        moments: Sums of the products of the elements and 1 over each part, shape (parts, n + 1, n + 1).
+        cross: Sums of their products with the code, shape (parts, n + 1, width).
+
+    Returns:
+        Shape (parts + 1, n + 1, width): learned without each part of the data, and from all of it.
+    """
+    lines = _regressions(*_left_out(moments, cross))
+    best = _losses(moments, cross, lines[:-1]).sum(axis=(0, 2)).argmin(axis=0)
+    return np.asarray(lines[:, best, :, np.arange(len(best))].transpose(1, 2, 0))
 
 
 def _left_out(moments: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

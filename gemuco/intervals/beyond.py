@@ -1,8 +1,9 @@
 """Estimates beyond what was learned: an output that is linear within it follows the linear path alone.
 
 The network's correction of such an output is a detail of the learned samples. Beyond them it is arbitrary. So are the
-weights of inputs that only went together in these samples, and the path is that of as few inputs as do no harm. Where
-the body is not linear the network is better there too.
+weights of inputs that only went together in these samples, and the path is that of as few inputs as do no harm. What
+all inputs say more is added where regressions without a part of the samples agree on it. Where the body is not linear
+the network is better there too.
 """
 
 from typing import NamedTuple
@@ -16,6 +17,9 @@ from gemuco.schema import BodySchema
 LINEAR = 0.05
 """An output is linear if the network's correction of the linear path, root mean square over the anchors, is below this
 many standard deviations: the path explains 99.75 % of its variance."""
+AGREED, STEEP = 3.0, 4
+"""Half of what all inputs say more is added where its standard error is this many times what it usually is; the second
+is the power with which the share falls beyond."""
 
 
 class Line(NamedTuple):
@@ -24,12 +28,18 @@ class Line(NamedTuple):
     Attributes:
         inputs: Indices in the layout of the elements that the mask lets through, shape (n,).
         outputs: Indices in the layout of the outputs, shape (k,).
-        matrix: The outputs [unit] by the inputs [unit] and 1, shape (n + 1, k).
+        few: The outputs [unit] by the inputs [unit] and 1, of which few are used, shape (n + 1, k).
+        more: What all inputs say more than the few, shape (n + 1, k).
+        usual: Root mean square of that over the anchors [unit], shape (k,).
+        parts: The outputs by all inputs, learned without each part of the samples, shape (parts, n + 1, k).
     """
 
     inputs: np.ndarray
     outputs: np.ndarray
-    matrix: np.ndarray
+    few: np.ndarray
+    more: np.ndarray
+    usual: np.ndarray
+    parts: np.ndarray
 
     def take_over(self, joined: np.ndarray, inside: float, missing: np.ndarray, value: np.ndarray) -> None:
         """Mix the path into the estimates of the missing outputs.
@@ -40,7 +50,10 @@ class Line(NamedTuple):
             missing: Whether each element is estimated, truth values, shape (size,).
             value: Every element [its unit], shape (size,); the estimates are changed in place.
         """
-        straight = joined[self.inputs] @ self.matrix[:-1] + self.matrix[-1]
+        row = np.append(joined[self.inputs], 1.0)
+        error = (row @ self.parts).std(axis=0) * np.sqrt(len(self.parts) - 1)  # the jackknife's standard error
+        ratio = np.divide(error, AGREED * self.usual, out=np.full_like(error, np.inf), where=self.usual > 0.0)
+        straight = row @ self.few + (row @ self.more) / (1.0 + ratio**STEEP)
         mixed = inside * value[self.outputs] + (1.0 - inside) * straight
         value[self.outputs] = np.where(missing[self.outputs], mixed, value[self.outputs])
 
@@ -70,9 +83,18 @@ def _line(schema: BodySchema, mask: Mask) -> Line | None:
     follows = np.flatnonzero(correction < LINEAR)
     if not len(follows):
         return None
-    few = np.stack([schema.path.by_few(through, int(output)) for output in follows], axis=1)
-    outputs = schema.out_index[follows]
-    matrix = few[np.append(through, True)] * std[outputs]
-    matrix[:-1] /= std[inputs][:, None]
-    matrix[-1] += mean[outputs] - mean[inputs] @ matrix[:-1]
-    return Line(inputs, outputs, matrix)
+    known, outputs = np.append(through, True), schema.out_index[follows]
+
+    def in_units(lines: np.ndarray) -> np.ndarray:
+        """Return lines of standard deviations, shape (k, ..., in_size + 1), in units, shape (..., n + 1, k)."""
+        lines = np.moveaxis(lines[..., known], 0, -1) * std[outputs]
+        lines[..., :-1, :] /= std[inputs][:, None]
+        lines[..., -1, :] += mean[outputs] - mean[inputs] @ lines[..., :-1, :]
+        return lines
+
+    few = in_units(np.stack([schema.path.by_few(through, int(output)) for output in follows]))
+    every = in_units(np.stack([schema.path.by_all(through, int(output)) for output in follows]))
+    more = every[-1] - few
+    rows = schema.scaler.restore(anchors)[:, inputs]
+    usual = np.sqrt(np.mean((rows @ more[:-1] + more[-1]) ** 2, axis=0))
+    return Line(inputs, outputs, few, more, usual, every[:-1])

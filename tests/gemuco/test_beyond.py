@@ -98,3 +98,36 @@ def test_a_body_that_has_changed_is_not_estimated_by_the_former_line(body):
     motor = far(2.0)
     seconds = estimate(changed, {"motor": motor})["second"].value
     np.testing.assert_allclose(seconds, by_network(changed, motor, "second"), atol=1e-5)
+
+
+def lifted(motor: np.ndarray) -> np.ndarray:
+    """Return a second encoder whose gear another axis bends a little [rad]."""
+    return RATIO * motor[:, :1] + OFFSET + 0.02 * motor[:, 2:]
+
+
+def recorded(other: np.ndarray) -> BodySchema:
+    """Return a model of one motion, in which another axis is the first one plus `other`, and the encoder drifts."""
+    time, drift = np.arange(2000) / 100.0, 0.005 * np.sin(np.arange(2000) / 200.0)[:, None]
+    first = np.sin(time / 1.5) + 0.3 * np.sin(2.7 * time)
+    motor = np.stack([first, np.cos(1.1 * time), 0.95 * first + other], axis=1)
+    units = {"motor": "rad", "second": "rad"}
+    schema, _ = fit(
+        {"motor": motor, "second": lifted(motor) + drift}, SETTINGS, [["motor"]], x_out=["second"], units=units
+    )
+    assert schema.path.by_few(np.ones(len(schema.in_index)), 0)[2] == 0.0
+    return schema
+
+
+def test_an_input_that_says_little_is_used_where_the_parts_of_the_data_agree_on_it():
+    schema = recorded(0.31 * np.sin(np.arange(2000) / 61.0))
+    asked = np.array([[1.5, 0.0, 0.95 * 1.5 + 0.3], [1.5, 0.0, 0.95 * 1.5 - 0.3], [-1.5, 0.0, -0.95 * 1.5 - 0.3]])
+    seconds = estimate(schema, {"motor": asked})["second"]
+    assert set(seconds.state) == {"unknown"}
+    np.testing.assert_allclose(seconds.value, lifted(asked), atol=4e-3)
+
+
+def test_an_input_that_follows_another_in_the_data_is_not_used_where_it_does_not():
+    schema = recorded(0.002 * np.sin(np.arange(2000) / 61.0))
+    asked = np.array([[1.5, 0.0, -1.5], [-1.5, 0.0, 1.5]])
+    value = estimate(schema, {"motor": asked})["second"].value
+    np.testing.assert_allclose(value, lifted(asked), atol=0.07)
