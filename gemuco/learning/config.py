@@ -14,7 +14,7 @@ BATCH = 50, 500
 """A batch that follows the data is a tenth of the samples, but not smaller and not larger than these."""
 STEPS = 4000
 """A number of epochs that follows the data is this many steps."""
-PATIENCE = 0.2
+PATIENCE = 0.4
 """A patience that follows the data is this share of the epochs."""
 
 
