@@ -1,10 +1,9 @@
 # Two images of one file. `services` is what a robot runs: router, hal, model, recorder. `workshop` is the same with what
-# pretends to be a robot and what trains (pybullet, torch, matplotlib), which are twice as large as all the rest.
+# pretends to be a robot and what trains (pybullet, matplotlib), which is larger than all the rest.
 # A tag may change: `docker buildx imagetools inspect` prints its digest, which GEMUCO_PYTHON in .env fixes (docs/deploy.md).
 ARG PYTHON=python:3.11-slim-bookworm
 
 FROM ${PYTHON} AS packages
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore
 WORKDIR /build
 RUN python -m venv --without-pip /opt/gemuco
@@ -42,9 +41,8 @@ ENTRYPOINT ["gemuco"]
 CMD ["--help"]
 
 FROM packages AS heavy
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 # Only what the first image lacks, in a folder of its own: both images share all the layers below it.
-RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet =joblib +train +sim +studies \
+RUN deploy/install.sh --target /opt/workshop =matplotlib =pybullet =joblib +train +sim +studies \
     && python deploy/sbom.py /opt/workshop/sbom.json /opt/gemuco/lib/python3.*/site-packages /opt/workshop
 
 FROM services AS workshop

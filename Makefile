@@ -121,7 +121,6 @@ wheel: $(STAMP)  ## the package as one file in build/wheel
 
 wheels: $(STAMP)  ## fill wheels/, from which the images are then built without a network
 	$(BIN)/python deploy/requirements.py --locked +train +sim +studies +build | $(BIN)/python -m pip download --quiet --dest wheels --require-hashes --no-deps --requirement /dev/stdin
-	$(BIN)/python -m pip download --quiet --dest wheels --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(grep '^torch==' constraints.txt)"
 
 lock: $(STAMP)   ## write requirements.lock: the hashes of the versions in constraints.txt
 	@mkdir -p build

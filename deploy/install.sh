@@ -1,7 +1,7 @@
 #!/bin/sh
 # install.sh [--target FOLDER] WORDS...: install into /opt/gemuco what deploy/requirements.py prints for these words, or
 # with the word `.` this package itself; then take away what no service ever reads. Every file has a hash in
-# requirements.lock but those of torch, which each index builds itself; it comes from one index alone.
+# requirements.lock.
 set -eu
 site=$(/opt/gemuco/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 target=""
@@ -18,7 +18,7 @@ list() {
         python deploy/requirements.py --locked "$@" >/tmp/wanted.txt
         how="--require-hashes --no-deps"
     else
-        python deploy/requirements.py "$@" | grep -v '^torch' >/tmp/wanted.txt
+        python deploy/requirements.py "$@" >/tmp/wanted.txt
         how="--constraint constraints.txt"
     fi
 }
@@ -36,19 +36,14 @@ else
         echo "wheels/ is not complete: asking the registry"
         $pip --find-links wheels $how --requirement /tmp/wanted.txt
     fi
-    if python deploy/requirements.py "$@" | grep -q '^torch'; then # from wheels/, else from one index and no other
-        torch=$(grep '^torch==' constraints.txt)
-        $pip --no-index --find-links wheels --no-deps "$torch" 2>/dev/null || $pip --no-deps --index-url "$TORCH_INDEX" "$torch"
-    fi
 fi
 
 # Tests, headers, static libraries and pybullet's models of other people's robots.
-for one in numpy matplotlib mpl_toolkits networkx sympy torch; do
+for one in numpy matplotlib mpl_toolkits; do
     [ ! -d "$folder/$one" ] || find "$folder/$one" -type d -name tests -prune -exec rm -rf {} +
 done
-[ ! -d "$folder/torch/bin" ] || find "$folder/torch/bin" -type f ! -name torch_shm_manager -delete # torch asks for that one
-rm -rf "$folder/torch/include" "$folder/torch/test" "$folder/torch/share" "$folder/pybullet_data" \
-    "$folder/pybullet_envs" "$folder/pybullet_examples" "$folder/pybullet_robots" "$folder/pybullet_utils"
+rm -rf "$folder/pybullet_data" "$folder/pybullet_envs" "$folder/pybullet_examples" "$folder/pybullet_robots" \
+    "$folder/pybullet_utils"
 find "$folder" -name '*.a' -delete
 if [ -n "$target" ]; then # what the other folder has already, in the same version
     for one in "$target"/*.dist-info; do

@@ -1,7 +1,7 @@
 #!/bin/sh
 # setup.sh PYTHON EXTRA...: make .venv with this package and these extras, in the exact versions of constraints.txt, and with
-# the hashes of requirements.lock where they hold. uv installs if it can be had, because pip takes ten times as long. torch
-# comes by pip, which a machine may give a folder or an index of builds without CUDA.
+# the hashes of requirements.lock where they hold. uv installs if it can be had, because pip takes ten times as long. torch,
+# which only tests and studies need, comes by pip, which a machine may give a folder or an index of builds without CUDA.
 set -eu
 python=$1
 shift

@@ -1,7 +1,7 @@
 """The model: a body schema on plain arrays, without robot, bus or clock.
 
 Users import from here: `from gemuco import estimate`. A name is imported from its room at its first use, so
-`import gemuco` loads neither numpy nor torch.
+`import gemuco` does not load numpy.
 """
 
 from importlib import import_module
@@ -110,14 +110,7 @@ else:
             return import_module("gemuco.plot")
         if name not in _ROOM_OF:
             raise AttributeError(f"module 'gemuco' has no attribute '{name}'")
-        try:
-            room = import_module(_ROOM_OF[name])
-        except ModuleNotFoundError as error:
-            if error.name != "torch":
-                raise
-            text = f"gemuco.{name} needs the package 'torch', not installed here: pip install 'gemuco[train]'."
-            raise ModuleNotFoundError(text, name="torch") from None
-        globals()[name] = value = getattr(room, name)
+        globals()[name] = value = getattr(import_module(_ROOM_OF[name]), name)
         return value
 
 

@@ -1,4 +1,4 @@
-"""Forward and backward passes of the network on plain numpy arrays; no torch, no state.
+"""Forward and backward passes of the network on plain numpy arrays, without state.
 
 A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a the activation of each layer. The latent state and
 the output are linear, so the encoder, the decoder and the whole network are chains. The last columns of a hidden layer

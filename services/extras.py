@@ -5,7 +5,6 @@ import importlib.util
 from services.errors import ServiceError
 
 EXTRAS = {
-    "torch": "train",
     "matplotlib": "train",
     "pybullet": "sim",
     "mujoco": "sim",

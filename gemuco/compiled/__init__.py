@@ -1,1 +1,1 @@
-"""Compiled code of every tick, without interpreter, GIL or torch. `gemuco.layers` has the same in plain numpy."""
+"""Compiled code of every tick, without interpreter or GIL. `gemuco.layers` has the same in plain numpy."""

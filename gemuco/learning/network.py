@@ -1,86 +1,47 @@
-"""The network as torch sees it: z = h_enc(x_in, m, p), x_out = h_dec(z); and the first weights of a training."""
+"""The first weights of a training: those of torch's linear layers with the same seed, drawn without torch."""
 
-import threading
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import torch
-from torch import nn
 
 from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 
-_drawing = threading.Lock()
-MODULES: dict[str, type[nn.Module]] = {
-    "tanh": nn.Tanh,
-    "sigmoid": nn.Sigmoid,
-    "relu": nn.ReLU,
-    "elu": nn.ELU,
-    "softplus": nn.Softplus,
-}
+DIGITS = 24
+"""A number is drawn from this many random bits, as many as a float32 keeps."""
 
 
-def _chain(sizes: Sequence[int], activation: str) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for index, (wide, narrow) in enumerate(pairwise(sizes)):
-        if index:
-            layers.append(MODULES[activation]())
-        layers.append(nn.Linear(wide, narrow))
-    return nn.Sequential(*layers)
-
-
-def _linear(chain: nn.Sequential) -> list[nn.Linear]:
-    return [layer for layer in chain if isinstance(layer, nn.Linear)]
-
-
-class Network(nn.Module):
-    """Encoder and decoder with an activation between linear layers; latent state and output are linear.
+def first_weights(seed: int, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str) -> Weights:
+    """Draw W: every weight and offset is uniform within 1 / sqrt(inputs of its layer).
 
     Args:
+        seed: Seed of the numbers; its lowest 32 bits count.
         inputs: Length of x_in, m and p together.
         outputs: Length of x_out.
         hidden: Widths from the input to the latent state; the decoder mirrors them.
         latent: Length of z.
-        activation: Name of the activation.
+        activation: Name of the activation between the layers; latent state and output are linear.
     """
-
-    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str = "tanh") -> None:
-        super().__init__()
-        self.activation = check_activation(activation)
-        self.encoder = _chain([inputs, *hidden, latent], activation)
-        self.decoder = _chain([latent, *reversed(hidden), outputs], activation)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return x_out, shape (samples, outputs), of inputs, shape (samples, inputs)."""
-        return self.decoder(self.encoder(x))
-
-    @property
-    def linear(self) -> list[nn.Linear]:
-        """Linear layers from the input to the output."""
-        return _linear(self.encoder) + _linear(self.decoder)
-
-    def weights(self) -> Weights:
-        """Copy W into numpy arrays."""
-
-        def export(chain: nn.Sequential) -> Chain:
-            linear = _linear(chain)
-            return tuple(
-                Layer(
-                    layer.weight.detach().numpy().T.copy(),
-                    layer.bias.detach().numpy().copy(),
-                    self.activation if index < len(linear) - 1 else LINEAR,
-                )
-                for index, layer in enumerate(linear)
-            )
-
-        return Weights(export(self.encoder), export(self.decoder))
+    random = np.random.RandomState(seed % 2**32)  # the generator of torch on a CPU
+    check_activation(activation)
+    encoder = _chain(random, [inputs, *hidden, latent], activation)
+    return Weights(encoder, _chain(random, [latent, *reversed(hidden), outputs], activation))
 
 
-def first_weights(seed: int, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str) -> Weights:
-    """Draw W; see `Network` for the sizes. Two trainings at once draw one after the other: torch has one source."""
-    with _drawing:
-        torch.manual_seed(seed)
-        return Network(inputs, outputs, hidden, latent, activation).weights()
+def _chain(random: np.random.RandomState, sizes: Sequence[int], activation: str) -> Chain:
+    layers = []
+    for wide, narrow in pairwise(sizes):
+        matrix = _uniform(random, wide, narrow * wide).reshape(narrow, wide).T.copy()
+        layers.append(Layer(matrix, _uniform(random, wide, narrow), activation))
+    return (*layers[:-1], layers[-1]._replace(activation=LINEAR))
+
+
+def _uniform(random: np.random.RandomState, inputs: int, count: int) -> np.ndarray:
+    """Return numbers of a layer with this number of inputs, shape (count,), float32."""
+    low = -np.float32(1.0 / math.sqrt(inputs))
+    share = (random.randint(0, 2**32, count, np.uint32) % 2**DIGITS) / 2.0**DIGITS
+    return (share * float(-2.0 * low) + float(low)).astype(np.float32)  # rounded once, as torch does
 
 
 def with_linear_path(weights: Weights, outputs: np.ndarray, place: int) -> Weights:

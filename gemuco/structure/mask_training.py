@@ -1,4 +1,4 @@
-"""Training of a network that infers every signal from any mask. `mask_errors` measures it without torch."""
+"""Training of a network that infers every signal from any mask. `mask_errors` measures it."""
 
 import threading
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait

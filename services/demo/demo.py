@@ -246,7 +246,7 @@ def check_start(robot: RobotConfig, with_page: bool = False) -> None:
         MissingExtra: A package for simulation, training or the page is not installed.
         AlreadyRunning: A service of a robot with this name runs on this machine.
     """
-    require("torch", "matplotlib", engine_of(robot.physics), *(("viser", "yourdfpy") if with_page else ()))
+    require("matplotlib", engine_of(robot.physics), *(("viser", "yourdfpy") if with_page else ()))
     open_robot(robot)  # builds the devices, and opens nothing
     running = [service for name, service in services_here() if name == robot.robot]
     if running:

@@ -65,7 +65,7 @@ class TrainingConfig(Section):
     held_out: Annotated[float, Field(gt=0, lt=1)] = DEFAULT.held_out
     """This share of every condition's data is held out from training and measures the loss."""
     patience: Count | None = DEFAULT.patience
-    """Training stops after this many epochs without a better held-out loss; with `null` after two fifths of the epochs."""
+    """Training stops after this many epochs without a better held-out loss; with `null` after two fifths of them."""
     outliers: Positive = DEFAULT.outliers
     """A signal that the others contradict by this many robust standard deviations is rejected; `.inf`: none."""
 

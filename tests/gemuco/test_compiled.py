@@ -10,12 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from muscle_arm import gravity
+from torch_network import Network
 
 from gemuco.compiled import descent, newton
 from gemuco.compiled.chain import pack, unpack
 from gemuco.compiled.learning import EQUAL, SQUARED, gradients, loss
 from gemuco.layers import ACTIVATIONS, Layer
-from gemuco.learning.network import Network
 from gemuco.search.descent import DescentConfig, NewtonConfig, descend, minimise
 from gemuco.search.fold import Lines, fold, linearised
 from gemuco.search.losses import Match, StayNear, StaySmall

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from torch_network import MODULES, Network
 
 from gemuco.errors import SchemaError
 from gemuco.layers import ACTIVATIONS, Curvature, pull, push, run, trace
-from gemuco.learning.network import MODULES, Network
+from gemuco.learning.network import first_weights
 
 INPUTS, OUTPUTS, SAMPLES = 9, 6, 4
 
@@ -96,7 +97,19 @@ def test_slope_and_bend_agree_with_finite_differences(name):
     assert np.isfinite(single).all()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 812, 2**31 + 5, 2**32 + 7])
+@pytest.mark.parametrize(("inputs", "hidden"), [(1, ()), (25, (200, 30)), (61, (300,))])
+def test_the_first_weights_are_those_of_torch(seed, inputs, hidden):
+    torch.manual_seed(seed)
+    theirs = Network(inputs, OUTPUTS, hidden, 15, "relu").weights()
+    ours = first_weights(seed, inputs, OUTPUTS, hidden, 15, "relu")
+    assert [layer.activation for layer in ours.whole] == [layer.activation for layer in theirs.whole]
+    for own, other in zip(ours.arrays(), theirs.arrays(), strict=True):
+        assert own.dtype == other.dtype == np.float32
+        np.testing.assert_allclose(own, other, rtol=0.0, atol=1e-7)
+
+
 def test_every_activation_is_known_to_torch_and_numpy():
     assert set(MODULES) == set(ACTIVATIONS)
     with pytest.raises(SchemaError, match=r"'swish' is not known\. Known activations: tanh, sigmoid, relu"):
-        Network(INPUTS, OUTPUTS, (20,), 5, "swish")
+        first_weights(0, INPUTS, OUTPUTS, (20,), 5, "swish")

@@ -2,7 +2,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from muscle_arm import LAYOUT
 
 from gemuco.dataset import Dataset, Episode
@@ -51,12 +50,6 @@ def test_a_loss_that_has_stopped_falling_ends_the_training_only_if_that_on_the_t
     course = Course(train=train, held_out=held_out, least=min(held_out), best_epoch=int(np.argmin(held_out)))
     state = SimpleNamespace(epoch=len(train), epochs=9, course=course, config=TrainConfig(patience=3))
     assert Learner.is_done.fget(state) == ends
-
-
-def test_leaves_the_number_of_threads_alone(data):
-    before = torch.get_num_threads()
-    fit(data, TINY, MASKS)
-    assert torch.get_num_threads() == before
 
 
 def test_trains_on_rows_with_gaps(arm):

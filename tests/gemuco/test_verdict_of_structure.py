@@ -11,7 +11,7 @@ from muscle_arm import MuscleArm
 import gemuco
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
-from gemuco.learning.network import Network
+from gemuco.learning.network import first_weights
 from gemuco.linear import LinearPath
 from gemuco.signals import Layout, Signal
 from gemuco.structure import determination, mask_training
@@ -58,7 +58,7 @@ def split_with(errors: dict[str, float], rest: float = 1.0) -> Measured:
             is_others = not mask[place] and sum(mask) == 2
             line.append(errors.get(f"{label}:{name}", errors.get(name, rest) if is_others else rest))
         table[mask] = line
-    chain = Network(6, 3, (4,), 2, "tanh").weights().whole
+    chain = first_weights(0, 6, 3, (4,), 2, "tanh").whole
     ones = np.ones((40, 3), np.float32)
     made = Measured(
         LAYOUT, chain, LinearPath.none(3, 3), ones, ones > 0, ones > 0, np.zeros((40, 0)), np.ones(3), np.full(3, 2.0)

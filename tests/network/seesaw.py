@@ -67,7 +67,7 @@ def statics(lengths: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def train(robot: RobotConfig, folder: Path) -> None:
-    """Make a model of the robot, in seconds; torch is loaded only here, for a simulator needs none."""
+    """Make a model of the robot, in seconds."""
     from gemuco.dataset import Dataset, Episode
     from gemuco.learning.train import TrainConfig, fit
 

@@ -126,7 +126,7 @@ def test_without_a_robot_the_machine_is_checked(capsys: pytest.CaptureFixture[st
 def test_the_installation_names_what_is_missing_and_what_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host_checks, "is_missing", lambda package: package == "viser")
     extras = {found.what: found.text for found in host_checks.installation()}["extras"]
-    assert extras.startswith("torch, ")
+    assert extras.startswith("matplotlib, ")
     assert extras.endswith(" Not installed: viser (view).")
 
 

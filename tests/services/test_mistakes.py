@@ -196,7 +196,7 @@ def test_a_port_that_is_taken_is_named(folder: Path) -> None:
     [
         ("mujoco", "sim", ("init", "panda.xml")),
         ("viser", "view", ("view", "good.yaml")),
-        ("torch", "train", ("demo", "musashi_arm")),
+        ("matplotlib", "train", ("demo", "musashi_arm")),
     ],
 )
 def test_a_missing_package_is_named_with_its_extra(

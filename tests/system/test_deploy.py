@@ -126,7 +126,7 @@ def _installed(name: str) -> bool:
 
 @pytest.mark.parametrize(
     "words",
-    [(), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+train", "+sim", "+studies"), ("+dev", "+build"),
+    [(), ("=matplotlib", "=pybullet", "=joblib", "+train", "+sim", "+studies"), ("+dev", "+build"),
      ("+build", "=setuptools")],
     ids=" ".join,
 )  # fmt: skip
@@ -149,7 +149,7 @@ def test_what_is_installed_by_hash_needs_nothing_else(
 
 def _is_in_small_image(name: str, words: tuple[str, ...]) -> bool:
     """The workshop's image lies on the small one."""
-    return "=torch" in words and name in {wanted.name_of(line) for line in wanted.PROJECT["dependencies"]}
+    return "=matplotlib" in words and name in {wanted.name_of(line) for line in wanted.PROJECT["dependencies"]}
 
 
 def test_no_second_index_can_slip_in_a_package() -> None:
@@ -262,11 +262,11 @@ def test_a_robots_services_need_nothing_of_what_its_image_lacks() -> None:
 def test_what_the_small_image_lacks_is_told_in_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(typer.Exit) as ended:
-        report_errors(lambda: __import__("torch"))()
+        report_errors(lambda: __import__("matplotlib"))()
     assert ended.value.exit_code == 1
-    assert "needs the package 'torch', not installed here: pip install 'gemuco[train]'." in capsys.readouterr().err
+    assert "needs the package 'matplotlib', not installed here: pip install 'gemuco[train]'." in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         report_errors(lambda: __import__("services.no_such_file"))()
 
@@ -281,8 +281,8 @@ def test_requirements_of_an_image() -> None:
     assert "numpy" in small
     assert not any(name in small for name in HEAVY)
     assert "numpy" not in requirements("-numpy").stdout
-    assert requirements("+train", "=torch", "+sim", "=pybullet").stdout.splitlines() == [
-        "torch>=2.6",
+    assert requirements("+train", "=matplotlib", "+sim", "=pybullet").stdout.splitlines() == [
+        "matplotlib>=3.9",
         "pybullet>=3.2.7; python_version < '3.12'",
     ]
     assert "does not ask for tensorflow" in requirements("-tensorflow").stderr

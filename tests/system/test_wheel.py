@@ -147,12 +147,16 @@ def test_a_missing_extra_is_named_in_one_sentence(fresh: Path, light: Path) -> N
         assert f"pip install 'gemuco[{extra}]'" in completed.stderr, completed.stderr
         assert completed.returncode == 1
         assert len(completed.stderr.strip().splitlines()) == 1
-    code = "import gemuco\ntry: gemuco.fit\nexcept ModuleNotFoundError as error: print(error)"
+
+
+@pytest.mark.slow
+def test_a_model_is_trained_without_an_extra(fresh: Path, light: Path) -> None:
+    code = (
+        "import gemuco, numpy; x = numpy.random.default_rng(0).normal(size=(200, 1)); "
+        "print(gemuco.fit({'a': x, 'b': 2.0 * x}, gemuco.TrainConfig(epochs=2), [['a']], x_out=['b'])[0].x_out)"
+    )
     completed = subprocess.run(
-        [fresh, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=light,
+        [fresh, "-c", code], capture_output=True, text=True, timeout=240, check=False, cwd=light,
         env=environment() | {"PYTHONPATH": str(light)},
     )  # fmt: skip
-    assert (
-        completed.stdout.strip()
-        == "gemuco.fit needs the package 'torch', not installed here: pip install 'gemuco[train]'."
-    )
+    assert completed.stdout.strip() == "('b',)", completed.stderr
