@@ -152,8 +152,9 @@ def test_a_missing_extra_is_named_in_one_sentence(fresh: Path, light: Path) -> N
 @pytest.mark.slow
 def test_a_model_is_trained_without_an_extra(fresh: Path, light: Path) -> None:
     code = (
-        "import gemuco, numpy; x = numpy.random.default_rng(0).normal(size=(200, 1)); "
-        "print(gemuco.fit({'a': x, 'b': 2.0 * x}, gemuco.TrainConfig(epochs=2), [['a']], x_out=['b'])[0].x_out)"
+        "import gemuco, numpy; x = numpy.random.default_rng(0).normal(size=(200, 1)); data = {'a': x, 'b': 2.0 * x}; "
+        "units = dict.fromkeys(data, 'rad'); settings = gemuco.TrainConfig(epochs=2); "
+        "print(gemuco.fit(data, settings, [['a']], x_out=['b'], units=units)[0].x_out)"
     )
     completed = subprocess.run(
         [fresh, "-c", code], capture_output=True, text=True, timeout=240, check=False, cwd=light,
