@@ -2,8 +2,8 @@
 
 The network's correction of such an output is a detail of the learned samples. Beyond them it is arbitrary. So are the
 weights of inputs that only went together in these samples, and the path is that of as few inputs as do no harm. What
-all inputs say more is added where regressions without a part of the samples agree on it. Where the body is not linear
-the network is better there too.
+all inputs say more is added where regressions without a part of the samples agree on it, and where it is not much more
+than it is within them. Where the body is not linear the network is better there too.
 """
 
 from typing import NamedTuple
@@ -17,9 +17,9 @@ from gemuco.schema import BodySchema
 LINEAR = 0.05
 """An output is linear if the network's correction of the linear path, root mean square over the anchors, is below this
 many standard deviations: the path explains 99.75 % of its variance."""
-AGREED, STEEP = 3.0, 4
-"""Half of what all inputs say more is added where its standard error is this many times what it usually is; the second
-is the power with which the share falls beyond."""
+AGREED, USUAL, STEEP = 4.0, 6.0, 4
+"""Half of what all inputs say more is added where its standard error is the first number of times what it usually is,
+and half where it is itself the second number of times that; the third is the power with which the shares fall."""
 
 
 class Line(NamedTuple):
@@ -52,8 +52,9 @@ class Line(NamedTuple):
         """
         row = np.append(joined[self.inputs], 1.0)
         error = (row @ self.parts).std(axis=0) * np.sqrt(len(self.parts) - 1)  # the jackknife's standard error
-        ratio = np.divide(error, AGREED * self.usual, out=np.full_like(error, np.inf), where=self.usual > 0.0)
-        straight = row @ self.few + (row @ self.more) / (1.0 + ratio**STEEP)
+        more, usual = row @ self.more, np.maximum(self.usual, 1e-12)
+        share = 1.0 / ((1.0 + (error / usual / AGREED) ** STEEP) * (1.0 + (more / usual / USUAL) ** STEEP))
+        straight = row @ self.few + share * more
         mixed = inside * value[self.outputs] + (1.0 - inside) * straight
         value[self.outputs] = np.where(missing[self.outputs], mixed, value[self.outputs])
 
