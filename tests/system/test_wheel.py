@@ -127,8 +127,8 @@ def test_the_wheel_collects_trains_and_plays_in_an_empty_folder(fresh: Path, tmp
 
 @pytest.fixture
 def light(fresh: Path, tmp_path: Path) -> Iterator[Path]:
-    """Folder in which the packages of the extras cannot be imported."""
-    hook = "import sys\n" + "\n".join(f"sys.modules[{name!r}] = None" for name in EXTRAS)
+    """Folder in which the packages of the extras, and torch, cannot be imported."""
+    hook = "import sys\n" + "\n".join(f"sys.modules[{name!r}] = None" for name in (*EXTRAS, "torch"))
     (tmp_path / "sitecustomize.py").write_text(hook)
     yield tmp_path
 
