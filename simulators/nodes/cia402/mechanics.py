@@ -80,7 +80,7 @@ class DriveMechanics:
         values, constants = self._values, self._constants
         self._raw = _finite((self._plant.read(self._element) - constants.zero) * constants.counts_per_unit)
         position = _clip(self._raw - self._origin, _INT32)
-        self._differentiate(position)
+        self._differentiate(self._raw - self._origin)
         if is_free:
             self._demand = position
             self._push = 0
@@ -220,7 +220,8 @@ class DriveMechanics:
         counts = float(self._constants.counts_per_turn) if code >> 16 & 0xFF == _REVOLUTION else 1.0
         return counts * 10.0**exponent / (60.0 if code >> 8 & 0xFF == _MINUTE else 1.0)
 
-    def _differentiate(self, position: int) -> None:
+    def _differentiate(self, position: float) -> None:
+        """Update the velocity, which a drive measures more finely than in counts per period."""
         time = self._plant.time
         if self._before is None:
             self._before = (time, position)
