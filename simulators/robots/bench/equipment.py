@@ -167,6 +167,8 @@ def hardware(config: RobotConfig) -> list[NodeSpec]:
         constants: Any = CONSTANTS[kind](settings)
         if hasattr(settings, "channels"):
             constants = replace(constants, more=_more(settings, device.elements))
+        if isinstance(constants, DriveConstants):
+            constants = replace(constants, load=device.elements.get("effort"))
         sheet = config.folder / settings.eds if hasattr(settings, "eds") else None
         nodes.append(NodeSpec(name, device.bus, device.node, element, constants, sheet))
     return nodes

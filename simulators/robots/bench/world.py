@@ -53,6 +53,7 @@ class BenchWorld(World):
     def drive(self, element: str, target: float, enabled: bool) -> None:
         self._servos[element] = (target, enabled)
 
+    @override
     def break_part(self, part: str) -> None:
         """Let an element read a value by `set:ELEMENT:VALUE` [its signal's unit], as in `set:muscle_tension.biceps:50`.
 

@@ -44,7 +44,7 @@ class UrdfArm:
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
         """Return the arm behind simulated nodes on the robot file's buses."""
         from simulators.rig import Rig
-        from simulators.robots.urdf_arm.hardware import hardware
+        from simulators.robots.bench.equipment import hardware
 
         return Rig(config, self.world(config, variant, seed, condition), hardware(config))
 
