@@ -33,18 +33,23 @@ _LARGEST_FLOATS = {16: 65504.0, 32: 3.4e38}
 """Values that fit into a float of this number of bits; a larger one could not be packed."""
 
 
+LONGEST = 8
+"""A frame of classic CAN has at most this number of data bytes."""
+
+
 class Dbc:
     """A DBC file. An unknown name is a `ConfigError` that lists the known ones.
 
     Attributes:
         path: The file.
         messages: Its messages.
-        left_out: Name of a message that contradicts itself -> how: signals that overlap, or that do not fit.
+        left_out: Name of a message that cannot be used -> why: it is longer than a frame, or its signals overlap or do
+            not fit.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
-        self.left_out = {message.name: wrong for message in database.messages if (wrong := _contradiction(message))}
+        self.left_out = {message.name: wrong for message in database.messages if (wrong := _fault_of(message))}
         self.messages = tuple(message for message in database.messages if message.name not in self.left_out)
         self._messages = {message.name: message for message in self.messages}
 
@@ -111,7 +116,7 @@ class Dbc:
 def load(path: Path) -> Dbc:
     """Read a DBC file, once per file.
 
-    Files of vendors have messages that contradict themselves. Only these are left out. Slips that change no value are
+    Files of vendors have messages that contradict themselves, or of CAN FD. Only these are left out. Slips that change no value are
     mended (`hal.protocols.dbc_text`).
 
     Raises:
@@ -128,8 +133,10 @@ def load(path: Path) -> Dbc:
     return Dbc(path, database)
 
 
-def _contradiction(message: Message) -> str:
-    """Return what is wrong with the layout of a message; empty if nothing is."""
+def _fault_of(message: Message) -> str:
+    """Return why a message cannot be used; empty if it can."""
+    if message.length > LONGEST:
+        return f"It has {message.length} bytes; a frame has at most {LONGEST}, and CAN FD is not supported."
     try:
         message.refresh(strict=True)
     except cantools.Error as error:

@@ -55,7 +55,10 @@ def test_a_folder_becomes_devices_with_what_the_files_state(folder: Path, tmp_pa
     drive, encoder, cell = (robot.devices[name] for name in ("acme_drive_3", "encoder", "cell"))
     assert robot.kinds["acme_drive_3"].settings["mode"] == "profile_position"
     assert robot.kinds["acme_drive_3"].settings["eds"] == "vendors/acme/Acme-Drive 3.EDS"
-    assert (drive.element, encoder.element) == ("motor_position.acme_drive_3", "joint_position.encoder")
+    assert drive.elements == {
+        quantity: f"motor_{quantity}.acme_drive_3" for quantity in ("position", "effort", "velocity")
+    }
+    assert encoder.element == "joint_position.encoder"
     assert (drive.node, encoder.node) == (1, 9)
     assert cell.elements == {"force": "force.cell_force", "heat": "temperature.cell_heat", "angle": "angle.cell_angle"}
     settings = robot.kinds["cell"].settings
@@ -72,7 +75,7 @@ def test_a_drive_that_cannot_watch_the_hal_has_a_line_to_set(folder: Path, tmp_p
     files.mkdir()
     (files / "plain.eds").write_text(DRIVE.replace("[1016", "[2016"))
     draft = draft_folder(files, "arm", tmp_path, SHIPPED)
-    assert draft.summary == "devices: 1, of them drives: 1, elements: 1; lines to set: 2."
+    assert draft.summary == "devices: 1, of them drives: 1, elements: 3; lines to set: 2."
     assert "allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)" in draft.text
     assert "allow_no_watchdog: true (" not in draft_folder(folder, "arm", tmp_path, SHIPPED).text
 
@@ -106,6 +109,33 @@ def test_a_drafted_folder_runs_on_the_bench(folder: Path, tmp_path: Path) -> Non
         cycle_until(robot, arrives("motor_position", np.array([0.1])), np.array([0.1]))
         cycle_until(robot, arrives("force", np.array([17.0]), 0.02))
         cycle_until(robot, lambda sample: np.isfinite(sample.values["joint_position"]).all())
+
+
+@pytest.mark.parametrize(
+    ("gone", "quantities", "to_set"),
+    [
+        ((), ["position", "effort", "velocity"], "rated_torque if object 6076h is not in mN m"),
+        (("6076",), ["position", "effort", "velocity"], ", rated_torque\n"),
+        (("606C",), ["position", "effort"], "rated_torque if"),
+        (("6077",), ["position"], "gear\n"),
+    ],
+)
+def test_a_drive_measures_what_its_data_sheet_can_send(
+    tmp_path: Path, gone: tuple[str, ...], quantities: list[str], to_set: str
+) -> None:
+    (tmp_path / "files").mkdir()
+    text = DRIVE
+    for index in gone:
+        text = text.replace(f"[{index}]", f"[{int(index, 16) - 0x4000:04X}]").replace(f"=0x{index}", "=0x2FFF")
+    (tmp_path / "files" / "drive.eds").write_text(text)
+    draft = draft_folder(tmp_path / "files", "arm", tmp_path, SHIPPED)
+    config = virtual(body_of(written(draft, tmp_path)))
+    device = config.devices["drive"]
+    assert [served.partition("_")[2].partition(".")[0] for served in device.served] == quantities
+    assert to_set in draft.text
+    assert ("rated_torque" in config.kinds["drive"].settings) == ("6076" in gone)
+    with running(config) as (robot, _):
+        assert states(robot) == {"drive": "ready"}
 
 
 def test_files_without_a_drive_have_one_that_stands_in(tmp_path: Path) -> None:
@@ -154,6 +184,54 @@ def test_contradictory_messages_are_left_out_and_said(tmp_path: Path) -> None:
     draft = draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED)
     assert load_robot(written(draft, tmp_path)).signals["voltage"].elements == ("unit_pull",)
     assert any(note.startswith("'unit.dbc': Twice, Long left out") and "overlapping" in note for note in draft.notes)
+
+
+def dbc_of(*messages: tuple[int, str], size: int = 8, sender: str = "X") -> str:
+    """Return a DBC file of messages with one signal each."""
+    lines = (f'BO_ {number} {name}: {size} {sender}\n SG_ {name} : 0|16@1+ (0.01,0) [0|600] "N" X\n'
+             for number, name in messages)  # fmt: skip
+    return f'VERSION ""\nBU_: {sender}\n' + "".join(lines)
+
+
+def test_files_whose_identifiers_collide_are_on_buses_of_their_own(tmp_path: Path) -> None:
+    files = tmp_path / "files"
+    files.mkdir()
+    (files / "a_drive.dcf").write_text(DRIVE + "[DeviceComissioning]\nNodeID=1\n")
+    (files / "b_first.dbc").write_text(dbc_of((0x311, "Pull")))
+    (files / "c_second.dbc").write_text(dbc_of((0x311, "Push")))
+    (files / "d_third.dbc").write_text(dbc_of((0x302, "Press"), (0x303, "Lift")))
+    (files / "e_drive.dbc").write_text(dbc_of((0x181, "Bend")))  # as the drive's first TPDO
+    (files / "f_sync.dbc").write_text(dbc_of((0x080, "Tear")))
+    draft = draft_folder(files, "cells", tmp_path, SHIPPED)
+    config = virtual(body_of(written(draft, tmp_path)))
+    buses = {name: device.bus for name, device in config.devices.items()}
+    others = {"c_second": "can1", "e_drive": "can1", "f_sync": "can1"}
+    assert buses == {"a_drive": "can0", "b_first": "can0", "d_third": "can0", **others}
+    assert sum("so it is on another bus" in note for note in draft.notes) == 3
+    with running(config) as (robot, _):
+        assert set(states(robot)) == set(buses)
+
+
+def test_messages_of_can_fd_are_left_out_and_said(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    long, short = dbc_of((5, "Long"), size=64), dbc_of((6, "Short"))
+    (tmp_path / "files" / "fd.dbc").write_text(long + short.partition("X\n")[2])
+    draft = draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED)
+    assert load_robot(written(draft, tmp_path)).signals["force"].elements == ("fd_short",)
+    assert any("Long left out" in note and "CAN FD is not supported" in note for note in draft.notes)
+
+
+def test_a_file_of_a_whole_car_gives_some_signals_of_every_node(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    nodes = [dbc_of(*((16 * node + number, f"F{node}_{number}") for number in range(9)), sender=f"Node{node:02d}")
+             for node in range(12)]  # fmt: skip
+    text = 'VERSION ""\nBU_: ' + " ".join(f"Node{node:02d}" for node in range(12)) + "\n"
+    text += "".join(node.split("\n", 2)[2] for node in nodes)
+    (tmp_path / "files" / "car.dbc").write_text(text)
+    draft = draft_folder(tmp_path / "files", "car", tmp_path, SHIPPED)
+    robot = load_robot(written(draft, tmp_path))
+    assert [len(robot.devices[f"node{node:02d}"].served) for node in range(12)] == [5] * 12
+    assert "'car.dbc': 48 of 108 signals left out; add those you need." in draft.notes
 
 
 def test_messages_of_the_host_are_left_out_and_said(tmp_path: Path) -> None:

@@ -48,8 +48,8 @@ STALE_PERIODS = 4
 """A value is stale after this number of periods."""
 SHORTEST = 8
 """A value without a unit has at least this number of bits."""
-MOST_SIGNALS = 24
-"""At most this many signals of one node are drafted."""
+MOST_SIGNALS, FEWEST_SIGNALS, MOST_OF_FILE = 24, 3, 64
+"""At most 24 signals of a node are drafted; fewer, but at least three, of nodes that have more than 64 together."""
 ODRIVE = {"Set_Axis_State", "Get_Encoder_Estimates", "Set_Input_Pos", "Heartbeat"}
 """A file with all of these messages describes an ODrive."""
 
@@ -73,6 +73,11 @@ def measured(message: Message) -> list[Signal]:
 def is_odrive(file: Dbc) -> bool:
     """Whether a file describes the axes of an ODrive."""
     return {message.name for message in file.messages} >= ODRIVE
+
+
+def identifiers_of(file: Dbc) -> set[int]:
+    """Return the identifiers of all messages, as a scan has them."""
+    return {_key(message) for message in file.messages}
 
 
 def nodes_of(file: Dbc) -> set[int]:
@@ -113,11 +118,16 @@ def parts_of(
             without.append(message.name)
         else:
             own.setdefault(sender if not sender.startswith("Vector__") else "", []).append(message)
-    parts = [_part(file, dbc, sender, messages, names, node + number, rates, notes)
+    most = min(MOST_SIGNALS, max(FEWEST_SIGNALS, MOST_OF_FILE // max(len(own), 1)))
+    parts = [_part(file, dbc, sender, messages, names, node + number, rates, notes, most)
              for number, (sender, messages) in enumerate(own.items())]  # fmt: skip
+    count = sum(len(list(_signals(messages))) for messages in own.values())
+    drafted = sum(len(part.measures) for part in parts)
+    if drafted < count:
+        notes.append(f"'{file.path.name}': {count - drafted} of {count} signals left out; add those you need.")
     if file.left_out:
         notes.append(
-            f"'{file.path.name}': {_listed(list(file.left_out))} left out, whose layout is contradictory: "
+            f"'{file.path.name}': {_listed(list(file.left_out))} left out, which cannot be used. The first one: "
             f"{next(iter(file.left_out.values()))}"
         )
     if commands:
@@ -139,14 +149,10 @@ def _part(
     node: int,
     rates: Mapping[int, float] | None,
     notes: list[str],
+    most: int,
 ) -> Part:
     name = names.new(sender if len(sender) > 3 else file.path.stem)
-    chosen = list(_signals(messages))
-    if len(chosen) > MOST_SIGNALS:
-        notes.append(
-            f"'{file.path.name}': {len(chosen) - MOST_SIGNALS} signals of {name} left out; add those you need."
-        )
-        chosen = chosen[:MOST_SIGNALS]
+    chosen = sorted(_signals(messages), key=lambda pair: unit_of(pair[1].unit) is None)[:most]
     used = [message for message in messages if any(message is one for one, _ in chosen)]
     periods = {message.name: _period(message, rates) for message in used}
     unknown = [message.name for message in used if rates is None and not message.cycle_time]

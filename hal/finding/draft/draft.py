@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hal.errors import ConfigError
@@ -12,10 +12,12 @@ from hal.finding.draft.servo_parts import servo_part
 from hal.finding.draft.sheets import FIRST_NODES, PROFILES, Sheet
 from hal.finding.draft.text import robot_text
 from hal.finding.scan import Node, Scan
-from hal.protocols import dbc
+from hal.protocols import cia301, dbc
 
 STAND_IN = "stand_in"
 LARGEST_NODE = 127
+FUNCTIONS = (0x080, *range(0x180, 0x600, 0x080), 0x600, 0x700)
+"""The identifiers of a CANopen device are these numbers plus its node id."""
 SUFFIXES = (".eds", ".dcf", ".dbc")
 DEPTH = 3
 """Files are looked for at most this many folders deep."""
@@ -54,7 +56,11 @@ class _Draughtsman:
     parts: list[Part] = field(default_factory=list)
     copies: dict[str, Path] = field(default_factory=dict)
     nodes: set[int] = field(default_factory=set)
+    identifiers: list[set[int]] = field(default_factory=lambda: [{cia301.NMT, cia301.SYNC}])
+    """Identifiers that are taken, by bus."""
     has_encoders: bool = False
+    waiting: int = 1
+    """Number of CANopen devices without a node id yet; a drive that stands in may be one."""
 
     @property
     def moved(self) -> str:
@@ -116,6 +122,7 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
     work = _Draughtsman(folder, shipped)
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(sheet.profile == 406 for sheet in known)
+    work.waiting += sum(not sheet.node for sheet in known)
     _add_sheets(work, [sheet for sheet in known if sheet.node])
     for path in files:  # before those without a node id, because the identifiers of a DBC file are not free to choose
         if path.suffix.lower() == ".dbc":
@@ -204,6 +211,7 @@ def _sheets(files: Sequence[Path], notes: list[str]) -> Iterator[Sheet]:
 def _add_sheets(work: _Draughtsman, known: Sequence[Sheet]) -> None:
     for sheet in known:
         node = work.node(sheet.node, FIRST_NODES[sheet.profile])
+        work.identifiers[0] |= {function + node for function in FUNCTIONS}
         work.parts.append(sheets.part_of(sheet, work.path_of(sheet.path), work.names, node, work.moved))
 
 
@@ -220,11 +228,29 @@ def _add_dbc(work: _Draughtsman, path: Path, result: Scan | None) -> None:
         return
     rates = None if result is None else result.unknown
     parts = dbc_parts.parts_of(file, own, work.names, work.node(None, 91), work.notes, rates)
-    work.nodes |= {part.node for part in parts} | dbc_parts.nodes_of(file)
-    work.parts += parts
+    bus = _bus_of(work, file) if result is None else 0
+    if bus:
+        work.notes.append(f"'{path.name}' has identifiers of another file, so it is on another bus.")
+    work.nodes |= {part.node for part in parts} | (set() if bus else dbc_parts.nodes_of(file))
+    work.parts += [replace(part, bus=bus) for part in parts]
     if not parts:
         where = "" if result is None else f" that was received on {result.bus}"
         work.notes.append(f"Left out: no message of '{path.name}'{where} has a measured value.")
+
+
+def _bus_of(work: _Draughtsman, file: dbc.Dbc) -> int:
+    """Return the first bus on which all identifiers of a DBC file are free, and take them.
+
+    Beside it the first bus must have room for the CANopen devices whose node ids are not chosen yet.
+    """
+    own = dbc_parts.identifiers_of(file)
+    has_room = len(work.nodes | dbc_parts.nodes_of(file) - {0}) + work.waiting <= LARGEST_NODE
+    fitting = (bus for bus, taken in enumerate(work.identifiers) if not taken & own and (bus > 0 or has_room))
+    bus = next(fitting, len(work.identifiers))
+    if bus == len(work.identifiers):
+        work.identifiers.append(set())
+    work.identifiers[bus] |= own
+    return bus
 
 
 def _add_node(work: _Draughtsman, node: Node, known: Sequence[Sheet]) -> None:

@@ -43,6 +43,7 @@ class Part:
         origin: File or node that it was drafted from.
         to_set: Settings that the user must replace, in words; empty if the file has all.
         is_drive: Whether it is commanded.
+        bus: Number of its bus, from 0; a DBC file with identifiers of another file has one of its own.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Part:
     origin: str
     to_set: str = ""
     is_drive: bool = False
+    bus: int = 0
 
 
 def is_text(name: str) -> bool:

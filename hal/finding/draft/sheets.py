@@ -6,9 +6,11 @@ from typing import Any
 
 import canopen
 
+from hal.commissioning.pdo_map import check_map, chosen_pdos, is_fixed
+from hal.drivers.cia402.settings import DriveSettings
 from hal.errors import ConfigError
 from hal.finding.draft.parts import Measure, Names, Part
-from hal.protocols import cia301
+from hal.protocols import cia301, cia402
 from hal.protocols.eds import read_sheet, value_of
 
 PROFILES = {402: "drive", 406: "encoder", 404: "cell", 401: "input"}
@@ -99,27 +101,51 @@ def part_of(sheet: Sheet, eds: str, names: Names, node: int, moved: str, name: s
     own = names.new(name or sheet.path.stem)
     settings: dict[str, Any] = {"eds": eds}
     to_set = ""
+    measures: tuple[Measure, ...] = ()
     if sheet.profile == 402:
-        signal, unit = moved, "rad"
         settings |= {"mode": _mode(sheet), "counts_per_turn": _counts(sheet, 0x608F) or 4096, "gear": 1.0}
         to_set = "gear" if _counts(sheet, 0x608F) else "counts_per_turn, gear"
+        measures = _measured(sheet, settings, own, moved)
+        if any(measure.quantity == "effort" for measure in measures):
+            is_stated = cia402.RATED_TORQUE.index in sheet.dictionary
+            settings |= {} if is_stated else {"rated_torque": 1.0}
+            to_set += ", rated_torque if object 6076h is not in mN m" if is_stated else ", rated_torque"
         if sheet.dictionary.get_variable(cia301.CONSUMER_HEARTBEAT, 1) is None:
             to_set += ", and allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)"
     elif sheet.profile == 406:
-        signal, unit = "joint_position", "rad"
+        measures = (Measure("position", "joint_position", own, "rad"),)
         to_set = "zero, direction"
     else:
-        signal, unit = "force", "N"
+        measures = (Measure("force", "force", own, "N"),)
         presets = INPUT_PRESETS if sheet.profile == 401 else CELL_PRESETS
         preset = next((name for index, name in presets if index in sheet.dictionary), presets[0][1])
         settings |= {"preset": preset}
         if sheet.profile == 401 or preset.startswith("counts"):
             settings |= {"gain": 0.01}
             to_set = "gain [N per count]"
-    quantity = "force" if unit == "N" else "position"
-    measure = Measure(quantity, signal, own, unit)
     driver = f"cia{sheet.profile}"
-    return Part(own, driver, settings, node, (measure,), sheet.path.name, to_set, is_drive=sheet.profile == 402)
+    return Part(own, driver, settings, node, measures, sheet.path.name, to_set, is_drive=sheet.profile == 402)
+
+
+def _measured(sheet: Sheet, settings: dict[str, Any], own: str, moved: str) -> tuple[Measure, ...]:
+    """Return position, effort and velocity of a drive, as far as its PDOs can carry them."""
+    part = moved.partition("_")[0]
+    measures = (
+        Measure("position", moved, own, "rad"),
+        Measure("effort", f"{part}_effort", own, "N m"),
+        Measure("velocity", f"{part}_velocity", own, "rad/s"),
+    )
+    drive = DriveSettings.model_validate(settings)
+    for count in range(len(measures), 1, -1):
+        pdos = drive.pdos(tuple(measure.quantity for measure in measures[:count]))
+        try:
+            if is_fixed(sheet.dictionary):
+                pdos = chosen_pdos(sheet.dictionary, pdos, (), own)
+            check_map(pdos, sheet.dictionary, own)
+        except ConfigError:
+            continue
+        return measures[:count]
+    return measures[:1]
 
 
 def _mode(sheet: Sheet) -> str:

@@ -25,13 +25,12 @@ rates: {{hal: 100, estimation: 100, control: 25, anomaly: 25, update: 5}}
 
 # From the bench to real hardware: {real}
 buses:
-  {bus}: {{interface: {simulated}, channel: {robot}_{bus}, bitrate: {bitrate}}}
-
+{buses}
 kinds:
 {kinds}
 devices:
 {devices}
-simulator: simulators.robots.bench:simulator  # the bench: every device answers, nothing is behind it
+simulator: simulators.robots.bench:body  # every device answers; made-up functions let the sensors follow the drives
 
 collect: {{samples: 2000, rate: 10}}  # random postures within the limits
 """
@@ -45,12 +44,16 @@ def robot_text(
     Args:
         robot: Name of the robot.
         source: What it was drafted from, in words.
-        bus: Name of its bus.
+        bus: Name of its bus; a number at its end is counted up for further ones.
         real: Interface and channel of the real bus, as YAML.
         bitrate: Bit rate [bit/s].
         parts: The devices.
         notes: Sentences on what was left out or guessed.
     """
+    simulated = "pty" if real.startswith(("interface: serial", "interface: pty")) else "hub"
+    stem = bus.rstrip("0123456789")
+    first = int(bus[len(stem) :] or 0)
+    names = [bus, *(f"{stem}{first + more}" for more in range(1, 1 + max(part.bus for part in parts)))]
     return HEAD.format(
         source=source,
         notes="".join(f"# {note}\n" for note in notes),
@@ -58,11 +61,11 @@ def robot_text(
         signals="".join(_signals(parts)),
         command=next(part.measures[0].signal for part in parts if part.is_drive),
         real=real,
-        simulated="pty" if real.startswith(("interface: serial", "interface: pty")) else "hub",
-        bus=bus,
-        bitrate=bitrate,
+        buses="".join(
+            f"  {name}: {{interface: {simulated}, channel: {robot}_{name}, bitrate: {bitrate}}}\n" for name in names
+        ),
         kinds="".join(_kind(part) for part in parts),
-        devices="".join(_device(part, bus) for part in parts),
+        devices="".join(_device(part, names[part.bus]) for part in parts),
     )
 
 
