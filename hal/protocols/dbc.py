@@ -116,8 +116,8 @@ class Dbc:
 def load(path: Path) -> Dbc:
     """Read a DBC file, once per file.
 
-    Files of vendors have messages that contradict themselves, or of CAN FD. Only these are left out. Slips that change no value are
-    mended (`hal.protocols.dbc_text`).
+    Files of vendors have messages that contradict themselves, or of CAN FD. Only these are left out. Slips that
+    change no value are mended (`hal.protocols.dbc_text`).
 
     Raises:
         ConfigError: It is missing or not a DBC file.

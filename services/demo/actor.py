@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.errors import NotEnoughData
 from hal.errors import CommandRefused
 from services.client import Client
 from services.errors import NoAnswer, NotEngaged, ServiceError, TooLate
@@ -109,6 +110,24 @@ class Actor:
             self.wait(ends(), duration)
             if self._follows():
                 return
+
+    def learn_normal(self, move: Callable[[], None], tries: int) -> str:
+        """Learn what is normal for this body, which is not the designer's; return a sentence on it.
+
+        Args:
+            move: Moves the robot, which brings more samples.
+            tries: Number of times that it is tried, with moves between.
+        """
+        refusal = ""
+        for left in reversed(range(tries)):
+            try:
+                reply = self._client.learn_normal()
+                return f"statistics of normal errors learned anew from {reply['samples']} samples"
+            except NotEnoughData as error:
+                refusal = f"statistics of normal errors not learned: {error}"
+            if left:  # a robot of many elements needs more samples
+                move()
+        return refusal
 
     def fault(self, text: str, service: str = "simulator") -> None:
         """Break a part of the simulated robot, or mend it; see `Client.fault`."""

@@ -4,7 +4,7 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,21 +19,18 @@ from hal.errors import ConfigError
 from hal.robot import open_robot
 from services import show
 from services.client import Client
-from services.demo import arm_story, pace, report, story, tool_story
+from services.demo import pace, report
 from services.demo.actor import Actor, NotFollowing
-from services.demo.arm_story import ArmStory
 from services.demo.live_view import Play, Screen, waiting
 from services.demo.page import playing_along
 from services.demo.report import CLIENT, Ending
-from services.demo.story import MUSCLE, Story
-from services.demo.timeline import Timeline
-from services.demo.tool_story import ToolStory
+from services.demo.stories.choice import story_of
+from services.demo.stories.scene import Scene
 from services.errors import AlreadyRunning, ServiceUnavailable
 from services.extras import engine_of, require
 from services.learning import collector, trainer
 from services.model import artifacts
 from services.model.control_config import ControlConfig
-from services.model.living_model import load_model
 from services.model.model_config import model_config
 from services.process.supervisor import NotReady, Supervisor, gemuco_command
 from services.runtime import services_here
@@ -106,7 +103,7 @@ def running(
     robot: RobotConfig, path: Path, seed: int, out: Path, supervisor: Supervisor, console: Console, with_page: bool
 ) -> Iterator[Cast]:
     """Start the processes at a rate for this machine; if it is not kept, restart them at half of it."""
-    target = control_of(robot).target
+    target = story_of(robot).watched(robot, control_of(robot))
     tried = pace.rates_to_try(robot.rates, with_page)
     if tried[0] != robot.rates:
         console.print(
@@ -170,33 +167,17 @@ def control_of(robot: RobotConfig) -> ControlConfig:
         ConfigError: The robot file has no control, or no story fits the robot.
     """
     control = model_config(robot).control
-    is_arm = arm_story.fits(robot, control)
-    if not (has_tools(robot) or is_arm) and MUSCLE not in robot.signals[robot.command.signal].elements:
-        raise ConfigError(
-            f"There is no story for '{robot.robot}': it needs a camera and encoders apart from its drives, as files of "
-            f"`gemuco init` have, or a camera and conditions, or a muscle {MUSCLE} to cut."
-        )
     if control is None:
         raise ConfigError(
-            f"The robot file of '{robot.robot}' has no model.control section, so there is nothing to play."
+            f"The robot file of '{robot.robot}' has no model.control section, so there is nothing to play. Name the "
+            f"signal that is moved to targets: `model: {{control: {{target: {robot.command.signal}}}}}`."
         )
+    story_of(robot)
     return control
 
 
-def has_tools(robot: RobotConfig) -> bool:
-    """Whether the robot holds one of several tools and has a camera."""
-    return bool(robot.conditions and robot.seen)
-
-
-def stage_names(robot: RobotConfig, control: ControlConfig) -> tuple[str, ...]:
-    """Return the names of the stages of the story that fits the robot."""
-    if has_tools(robot):
-        return tool_story.NAMES
-    return arm_story.NAMES if arm_story.fits(robot, control) else story.NAMES
-
-
 def perform(cast: Cast, seed: int, picture: Path, services: Collection[str], link: str) -> None:
-    """Play and draw the story that fits the robot: tools, or a sensor and a muscle; `link` is that of the page."""
+    """Play and draw the story that fits the robot; `link` is that of the page."""
     robot, control = cast.robot, control_of(cast.robot)
     remote = cast.remote
 
@@ -204,38 +185,12 @@ def perform(cast: Cast, seed: int, picture: Path, services: Collection[str], lin
         counts = f"{CLIENT}: {remote.lines} estimates, {remote.estimated} of them not measured"
         return [counts, f"page: {link}"] if link else [counts]
 
-    play = Play(stage_names(robot, control), cast.actor.played, (control.target, *robot.seen), footer)
+    story = story_of(robot)
+    play = Play(story.names, cast.actor.played, (control.target, *robot.seen), footer)
+    scene = Scene(robot, control, cast.client, cast.actor, cast.screen.report, seed, picture)
     with cast.screen.live(robot, cast.client, play, services):
-        draw = _play_story(cast, control, seed, picture)
+        draw = story.play(scene)
     draw()
-
-
-def _play_story(cast: Cast, control: ControlConfig, seed: int, picture: Path) -> Callable[[], None]:
-    """Play; return a function that draws the picture."""
-    robot, client, actor, report, target = cast.robot, cast.client, cast.actor, cast.screen.report, control.target
-    sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
-    if has_tools(robot):
-        from services.demo import tool_plot
-
-        schema = load_model(robot, artifacts.model_folder(robot.robot))
-        with Timeline(client, target, *sizes, robot.seen) as timeline:
-            tool_marks = ToolStory(robot, client, timeline, seed, actor, report, schema).play()
-        return lambda: tool_plot.plot(robot, target, schema, timeline, tool_marks, picture)
-    if arm_story.fits(robot, control):
-        from services.demo import arm_plot
-
-        (seen,) = robot.seen
-        with (
-            Timeline(client, target, *sizes, [target]) as joints,
-            Timeline(client, seen, robot.signals[seen].size, sizes[1], [seen]) as tip,
-        ):
-            arm_marks = ArmStory(robot, client, joints, tip, control, seed, actor, report).play()
-        return lambda: arm_plot.plot(robot, target, joints, tip, arm_marks, picture)
-    from services.demo import story_plot
-
-    with Timeline(client, target, *sizes, [target]) as timeline:
-        marks = Story(robot, client, timeline, seed, actor, report).play()
-    return lambda: story_plot.plot(robot, timeline, marks, picture)
 
 
 def check_start(robot: RobotConfig, with_page: bool = False) -> None:

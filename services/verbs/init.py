@@ -131,8 +131,8 @@ def _of_devices(source: Path | None, scan: str | None, bitrate: int, name: str |
     _write(file, draft.text, copies)
     _report(file, draft.summary, draft.notes)
     typer.echo(
-        f"Next: complete the lines with 'set' in {file}; then gemuco simulate {file}, gemuco hal {file}, "
-        f"gemuco doctor {file}"
+        f"Next: complete the lines with 'set' in {file}; then gemuco demo {file}, or, step by step, gemuco simulate "
+        f"{file}, gemuco hal {file}, gemuco doctor {file}"
     )
 
 

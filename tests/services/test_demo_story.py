@@ -11,10 +11,10 @@ from gemuco.errors import NotEnoughData
 from hal.config import load_robot
 from hal.errors import CommandRefused
 from services.demo import actor as actor_module
-from services.demo import story as story_module
 from services.demo.actor import NOTICED_WITHIN, REACHED_WITHIN, TRIES, Actor
-from services.demo.arm_story import ArmStory
-from services.demo.story import (
+from services.demo.stories import muscle_story as story_module
+from services.demo.stories.arm_story import NORMAL_TRIES, ArmStory
+from services.demo.stories.muscle_story import (
     CALM_TRIES,
     LEARNED,
     LEARNING_POSES,
@@ -22,7 +22,7 @@ from services.demo.story import (
     NORMAL,
     POSE_TIME,
     TRUE_POSES,
-    Story,
+    MuscleStory,
     leaks,
 )
 from services.errors import ServiceError, ServiceUnavailable, TooLate, TooSlow
@@ -40,8 +40,8 @@ class Machine:
         self.said: list[str] = []
         self.normals: list[int] = []
 
-    def story(self) -> Story:
-        return Story(ROBOT, self, self, 0, self, self.said.append)  # type: ignore[arg-type]
+    def story(self) -> MuscleStory:
+        return MuscleStory(ROBOT, self, self, 0, self, self.said.append)  # type: ignore[arg-type]
 
     def update(self, timeout: float = 0.0) -> Update:
         return Update(active=True, model_version=1, window=self.window, dropped=0, loss=0.0)
@@ -185,9 +185,9 @@ def test_an_arm_of_many_joints_moves_on_until_its_normal_errors_are_learned(
 ) -> None:
     model = ManyJoints(needed)
     story = ArmStory.__new__(ArmStory)
-    story._client = model  # type: ignore[assignment]
     monkeypatch.setattr(ArmStory, "_go", lambda _: model.go())
-    assert words in story._learn_normal()
+    actor = Actor(model, lambda: None, print)  # type: ignore[arg-type]
+    assert words in actor.learn_normal(story._go_on, NORMAL_TRIES)
     assert model.moves == moves
 
 
@@ -274,7 +274,7 @@ class Creeping:
 def test_a_test_pose_lasts_until_the_arm_rests(monkeypatch: pytest.MonkeyPatch, arrives: float, waited: float) -> None:
     arm = Creeping(arrives)
     monkeypatch.setattr(story_module, "time", arm)
-    played = Story(ROBOT, arm, arm, 0, arm, print)  # type: ignore[arg-type]
+    played = MuscleStory(ROBOT, arm, arm, 0, arm, print)  # type: ignore[arg-type]
     played._actor.go("joint_position", np.zeros(5), POSE_TIME, ends=played._at_rest)
     assert arm.waited == pytest.approx(waited, abs=0.03)
 

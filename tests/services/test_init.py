@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from hal.config import load_robot
-from services.demo import arm_story
 from services.demo.demo import control_of
+from services.demo.stories import arm_story
 from services.model.model_config import model_config
 
 ROOT = Path(__file__).parents[2]

@@ -90,7 +90,7 @@ WORDS = [
     (("collect", "good.yaml"), "has no 'collect' section, so its safe motion is unknown. docs/robots.md, Collecting"),
     (("collect", "musashi_arm", "--variant", "broken"), "has no variant 'broken'. Known variants: geometric, actual."),
     (("simulate", "kxr_humanoid", "--condition", "axe"), "has no condition 'axe'. Known conditions: short_light"),
-    (("demo", "good.yaml"), "There is no story for"),
+    (("demo", "good.yaml"), "has no model.control section, so there is nothing to play. Name the signal"),
     (("query", "good.yaml", "estimat", "joint_position"), "'estimat' is not a verb of query. Known: estimate"),
     (("query", "good.yaml", "move", "joint_position", "far"), "takes numbers after the signal, not 'far'."),
     (("query", "good.yaml", "fault"), "needs a fault of the simulator"),

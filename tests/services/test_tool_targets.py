@@ -3,7 +3,7 @@ import pytest
 from small_hand import TOOLS, config, gravity_of, tip_of
 
 from hal.errors import ConfigError
-from services.demo.tool_targets import APART, CLOSE, common_targets
+from services.demo.stories.tool_targets import APART, CLOSE, common_targets
 from services.learning.motion import NowhereToGo
 
 BOTH = ("short", "long")

@@ -33,6 +33,11 @@ devices:
 simulator: simulators.robots.bench:body  # every device answers; made-up functions let the sensors follow the drives
 
 collect: {{samples: 2000, rate: 10}}  # random postures within the limits
+
+model:
+  # 0.5 is 70 % of a standard deviation: every signal is an output, and its expected error says how good it is.
+  structure: {{threshold_out: 0.5, threshold_in: 0.5}}
+  control: {{target: {command}, speed: 0.4}}  # below the rate above
 """
 
 

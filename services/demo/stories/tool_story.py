@@ -12,9 +12,10 @@ from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.client import Client
 from services.demo.actor import NOTICED_WITHIN, Actor, Stage
+from services.demo.stories.tool_targets import common_targets
 from services.demo.timeline import Timeline
-from services.demo.tool_targets import common_targets
 from services.errors import ServiceError
+from services.model.control_config import ControlConfig
 from services.model.model_config import model_config
 from services.wire.messages import Update
 
@@ -48,6 +49,11 @@ class ToolMarks:
     reached: list[tuple[float, float]] = field(default_factory=list)
     """Time of every measurement at a target, and distance of the tip from the target."""
     stages: list[Stage] = field(default_factory=list)
+
+
+def fits(robot: RobotConfig, control: ControlConfig | None) -> bool:
+    """Whether the robot holds one of several tools and has a camera."""
+    return control is not None and bool(robot.conditions and robot.seen)
 
 
 class ToolStory:

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from gemuco.adaption.recognise import Prior
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
-from services.demo.score_plot import draw_score
+from services.demo.stories.score_plot import draw_score
+from services.demo.stories.tool_story import ToolMarks
 from services.demo.timeline import Timeline
-from services.demo.tool_story import ToolMarks
 from services.learning.plots import picture
 
 GREY, RED, GREEN, BLUE = "0.45", "tab:red", "tab:green", "tab:blue"

@@ -11,6 +11,7 @@ from hal.config import RobotConfig
 from services.client import Client
 from services.demo.actor import NOTICED_WITHIN, Actor, Stage
 from services.demo.timeline import Timeline, hidden_error
+from services.model.control_config import ControlConfig
 from services.wire.messages import Anomaly
 
 POSE_TIME = 2.5
@@ -69,7 +70,12 @@ class Marks:
     stages: list[Stage] = field(default_factory=list)
 
 
-class Story:
+def fits(robot: RobotConfig, control: ControlConfig | None) -> bool:
+    """Whether the robot has the muscle that is cut."""
+    return control is not None and MUSCLE in robot.signals[robot.command.signal].elements
+
+
+class MuscleStory:
     """Stages of the demo, played by a client."""
 
     def __init__(

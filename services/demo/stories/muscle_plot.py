@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
-from services.demo.score_plot import draw_score
-from services.demo.story import MUSCLE, SILENT_ELEMENT, Marks
+from services.demo.stories.muscle_story import MUSCLE, SILENT_ELEMENT, Marks
+from services.demo.stories.score_plot import draw_score
 from services.demo.timeline import Timeline
 from services.learning.plots import picture
 

@@ -1,16 +1,15 @@
 """Story of any arm with encoders behind its gears and a camera: it moves, loses an encoder, and loses its sight."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from statistics import mode
 
 import numpy as np
 
-from gemuco.errors import NotEnoughData
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from services.client import Client
-from services.demo.actor import NOTICED_WITHIN, Actor, Stage
+from services.demo.actor import NOTICED_WITHIN, Stage
+from services.demo.stories.scene import Scene
 from services.demo.timeline import Timeline
 from services.hardware.stand_in import simulator_of
 from services.learning.collector import motion_of
@@ -68,15 +67,14 @@ def fits(robot: RobotConfig, control: ControlConfig | None) -> bool:
 class ArmStory:
     """Stages of the demo, played by a client."""
 
-    def __init__(
-        self, robot: RobotConfig, client: Client, joints: Timeline, tip: Timeline, control: ControlConfig, seed: int,
-        actor: Actor, report: Callable[[str], None],
-    ) -> None:  # fmt: skip
-        """Call `report` with a line of text per event; the timelines are of the joints and of what the camera sees."""
-        self._client, self._joints, self._tip, self._actor, self._report = client, joints, tip, actor, report
+    def __init__(self, scene: Scene, joints: Timeline, tip: Timeline) -> None:
+        """Prepare; the timelines are of the joints and of what the camera sees."""
+        robot, control = scene.robot, scene.control
+        self._client, self._joints, self._tip = scene.client, joints, tip
+        self._actor, self._report = scene.actor, scene.report
         self._robot, self._signal, self._speed = robot, control.target, control.speed
         (self._seen,) = robot.seen
-        self._postures = rests(robot, seed)
+        self._postures = rests(robot, scene.seed)
         self._place = next(self._postures)
         encoders = encoders_of(robot, control.target)
         # The joint in the middle of the arm moves the tip and carries a load.
@@ -105,7 +103,7 @@ class ArmStory:
         figures = (
             f"{MOVES} postures, {miss:.3f} rad away from them on average (norm of {len(self._place)} joints)",
             f"the joint that moved most moved by {span:.2f} rad",
-            self._learn_normal(),
+            self._actor.learn_normal(self._go_on, NORMAL_TRIES),
         )
         return Stage(NAMES[0], start, self._joints.now(), figures, miss < FOLLOWS and span > 0.2)
 
@@ -168,18 +166,9 @@ class ArmStory:
         self._place = goal
         self._actor.go(self._signal, goal, duration)
 
-    def _learn_normal(self) -> str:
-        """Learn what is normal for this body, which is not the designer's; return a sentence on it."""
-        for tries_left in reversed(range(NORMAL_TRIES)):
-            try:
-                reply = self._client.learn_normal()
-                return f"statistics of normal errors learned anew from {reply['samples']} samples"
-            except NotEnoughData as error:
-                refusal = f"statistics of normal errors not learned: {error}"
-            if tries_left:  # an arm of many joints needs more samples
-                for _ in range(MORE_MOVES):
-                    self._go()
-        return refusal
+    def _go_on(self) -> None:
+        for _ in range(MORE_MOVES):
+            self._go()
 
     def _estimated(self, signal: str, index: int) -> bool:
         estimate = self._client.estimate()

@@ -1,0 +1,1 @@
+"""The stories that `gemuco demo` can play, and their pictures."""
