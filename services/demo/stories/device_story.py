@@ -123,7 +123,7 @@ class DeviceStory:
         marks.silent = (start, end)
         if marks.is_drive:
             self._actor.engage()
-            self._go()
+        self._go()
         figures, share = self._errors(lost + delay, end)
         figures = (
             f"marked as estimated after {1e3 * delay:.0f} ms, {figures[0]}",

@@ -28,7 +28,7 @@ def draw_lost(axis: Axes, timeline: Timeline, index: int, label: str, device: st
     lost = np.where(estimated[:, index] > 0, value[:, index], np.nan)
     axis.plot(time, lost, color=RED, linewidth=2, label="of which estimated")
     axis.set_ylabel(label)
-    axis.legend(loc="lower left", ncols=4, fontsize=8)
+    axis.legend(loc="best", ncols=4, fontsize=8)
 
 
 def draw_score(axis: Axes, timeline: Timeline, color: str) -> None:
