@@ -18,6 +18,12 @@ WAIT = 0.3
 """After this time [s] without a frame, samples are used without the camera."""
 GAP = 0.1
 """Between two samples that are further apart [s] nothing is interpolated."""
+SLOW, SLOWEST = 0.03, 0.25
+"""An element with a longer interval [s] between its values is slow; values further apart are not interpolated."""
+LEARNED = 0.25
+"""Share of the newest interval in the usual one."""
+SAME = 1e-3
+"""Times that differ by less than this [s] are of one value: stamps are rounded."""
 MOST = 256
 """At most this number of samples, and of frames, is kept."""
 TIMING = 0.005
@@ -82,6 +88,79 @@ class Aligned:
         if second - first > GAP:
             return None
         return np.asarray(before + (time - first) / (second - first) * (after - before))
+
+
+class _Waiting(NamedTuple):
+    """A row of which slow elements are not known yet.
+
+    Attributes:
+        time: Time of the row [s].
+        row: Every element, shape (size,); NaN where it is not known.
+        open: Whether each element may still become known, shape (size,).
+    """
+
+    time: float
+    row: np.ndarray
+    open: np.ndarray
+
+
+class Interpolated:
+    """Rows of all elements at the times of the samples, those that are read less often interpolated.
+
+    A sample holds the newest value of every element. A message of a car comes every 0.1 s: at 1 rad/s the joint that
+    is read in every cycle has moved by up to 0.1 rad since then, and beside such values a right one looks wrong. A row
+    with a slow element waits until its next value; without slow elements none waits.
+    """
+
+    def __init__(self, size: int) -> None:
+        """Prepare for rows of `size` elements."""
+        self._at, self._values = np.full(size, np.nan), np.full(size, np.nan)
+        self._interval = np.zeros(size)
+        self._waiting: deque[_Waiting] = deque(maxlen=MOST)
+        self._newest = -math.inf
+
+    @property
+    def is_late(self) -> bool:
+        """Whether rows wait, because some elements are slow."""
+        return bool((self._interval > SLOW).any())
+
+    def add(self, time: float, row: np.ndarray, at: np.ndarray) -> None:
+        """Add a sample; one that is not newer than the one before is ignored.
+
+        Args:
+            time: Time of the sample [s].
+            row: Newest value of every element [its unit], shape (size,); NaN where not measured.
+            at: Time at which each value was measured [s], shape (size,).
+        """
+        if time <= self._newest:
+            return
+        self._newest = time
+        is_there = np.isfinite(row) & np.isfinite(at)
+        step = at - self._at
+        is_first = is_there & ~np.isfinite(step)
+        is_new = is_there & (step > SAME)
+        self._interval[is_new] += LEARNED * (np.minimum(step[is_new], SLOWEST) - self._interval[is_new])
+        fits = is_new & (step <= SLOWEST)
+        for waiting in self._waiting:
+            known = waiting.open & fits & (self._at <= waiting.time) & (waiting.time <= at)
+            if known.any():
+                share = (waiting.time - self._at[known]) / step[known]
+                waiting.row[known] = self._values[known] + share * (row[known] - self._values[known])
+            waiting.open[:] &= ~(is_new & (at >= waiting.time))
+        own = row.copy()
+        is_open = is_there & (self._interval > SLOW) & (time - at > SAME)
+        own[is_open] = np.nan
+        self._waiting.append(_Waiting(time, own, is_open))
+        self._at = np.where(is_new | is_first, at, np.where(is_there, self._at, np.nan))
+        self._values = np.where(is_new | is_first, row, self._values)
+
+    def take(self, now: float) -> list[tuple[float, np.ndarray]]:
+        """Return the time [s] and values, shape (size,), of the rows that need not wait any longer, oldest first."""
+        taken = []
+        while self._waiting and (not self._waiting[0].open.any() or now - self._waiting[0].time >= WAIT):
+            waiting = self._waiting.popleft()
+            taken.append((waiting.time, waiting.row))
+        return taken
 
 
 class Shift(NamedTuple):

@@ -12,7 +12,7 @@ from hal.config import RobotConfig
 from hal.robot import Robot
 from services.client import Client
 from services.errors import ServiceError
-from services.model.estimation import Freshness
+from services.model.estimation import Freshness, OneTime
 from services.wire import keys
 from services.wire.messages import Sample
 
@@ -101,7 +101,8 @@ class BusPlayground(Playground):
         self._interval = 1.0 / rate
         self._samples = client.reader(keys.sample(robot.robot), Sample)
         seen = client.reader(keys.vision(robot.robot), Sample)
-        self._freshness = Freshness(robot, self._samples.last, SystemClock(), seen.last if robot.seen else None)
+        freshness = Freshness(robot, self._samples.last, SystemClock(), seen.last if robot.seen else None)
+        self._one_time = OneTime(freshness)
         self._began = self._recorded = time.monotonic()
         deadline = time.monotonic() + ENABLE_WITHIN
         client.enable()
@@ -121,9 +122,10 @@ class BusPlayground(Playground):
                     f"The robot went to '{mode}'. `gemuco top {self._robot.robot}` may show the reason."
                 )
             self._client.command(self._robot.command.signal, command, sample)
-            if now - self._recorded >= self._interval:
+            rows = self._one_time.rows(now)
+            if rows and now - self._recorded >= self._interval:
                 self._recorded = now
-                yield self._freshness.take()[1]
+                yield rows[-1]
 
     @override
     def elapsed(self) -> float:

@@ -13,6 +13,7 @@ from gemuco.compiled.usable import usable
 from gemuco.estimation import fill
 from gemuco.intervals.sureness import DOUBTFUL, SURE, Sureness
 from gemuco.schema import BodySchema
+from gemuco.trust.aligned import Aligned, Interpolated
 from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock
 from hal.config import RobotConfig
@@ -55,10 +56,12 @@ class Dated(NamedTuple):
     Attributes:
         time: Time of measurement [monotonic s of this process]; NaN without a sample.
         values: All elements of the model [unit], shape (size,), NaN where not usable; the same array until they change.
+        at: Time at which each of them was measured [monotonic s], shape (size,); NaN where not known.
     """
 
     time: float
     values: np.ndarray
+    at: np.ndarray
 
 
 class Freshness:
@@ -110,7 +113,7 @@ class Freshness:
         return fresh, self._trusted.of(values, self.distrust)
 
     def together(self) -> tuple[Arrival[Sample] | None, Numbers]:
-        """Return the same as `take`, but of a robot with a camera values that were measured at one time.
+        """Return the same as `take`, but with a camera or slow sensors values that were measured at one time.
 
         A camera reports later than encoders, so the newest values of a moving robot do not belong together: at 2 rad/s
         the hand moves by centimetres in this time. They are older than the newest ones by the delay of the camera.
@@ -122,9 +125,14 @@ class Freshness:
         return fresh, self._trusted_aligned.of(aligned[1], self.distrust)
 
     def align(self, values: Numbers) -> None:
-        """Take the newest values that were measured at one time, of a robot with a camera."""
+        """Take the newest values that were measured at one time, of a robot with a camera or slow sensors."""
         _unwritable(values.flat)
         self._aligned = self._clock.monotonic(), values
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether the robot has a camera."""
+        return self._vision is not None
 
     def measured(self) -> tuple[Arrival[Sample] | None, Numbers]:
         """Return the same as `take`, with the values of distrusted elements."""
@@ -149,11 +157,47 @@ class Freshness:
 
     def _dated(self, source: "_Source", arrival: Arrival[Sample] | None, now: float) -> Dated:
         if arrival is None:
-            return Dated(math.nan, self._nothing[0])
+            return Dated(math.nan, self._nothing[0], self._nothing[0])
         age = arrival.message.age.flat
         youngest = float(np.min(age, initial=math.inf, where=np.isfinite(age)))
         values, _ = source.usable(arrival, now)
-        return Dated(arrival.received - (youngest if math.isfinite(youngest) else 0.0), values)
+        at = arrival.received - source.ages(arrival.message)
+        return Dated(arrival.received - (youngest if math.isfinite(youngest) else 0.0), values, at)
+
+
+class OneTime:
+    """The samples of a robot whose values were all measured at one time, although a camera and slow sensors are late.
+
+    One thread asks for them.
+    """
+
+    def __init__(self, freshness: Freshness) -> None:
+        """Prepare for the samples of a source."""
+        self._freshness = freshness
+        self._interpolated, self._aligned = Interpolated(freshness.elements.size), Aligned()
+        self._hal, self._camera = np.zeros(0), np.zeros(0)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the values are older than the newest ones."""
+        return self._freshness.has_camera or self._interpolated.is_late
+
+    def rows(self, now: float) -> list[Numbers]:
+        """Return the new ones at a time [monotonic s], oldest first; values are NaN where they are missing."""
+        hal, camera = self._freshness.apart()
+        is_new, self._hal = hal.values is not self._hal, hal.values
+        if is_new and math.isfinite(hal.time):
+            self._interpolated.add(hal.time, hal.values, hal.at)
+        dated = self._interpolated.take(now)
+        rows = [row for _, row in dated]
+        if camera is not None:
+            for time, row in dated:
+                self._aligned.add(time, row)
+            if camera.values is not self._camera and math.isfinite(camera.time):
+                self._camera = camera.values
+                self._aligned.see(camera.time, camera.values)
+            rows = self._aligned.take(now)
+        return [Numbers(row, self._freshness.elements) for row in rows]
 
 
 class _Rest:
@@ -205,14 +249,25 @@ class _Source:
             kept = self._kept = published, passed, values, bool(np.isfinite(values).any())
         return kept[2], kept[3]
 
-    def _published(self, sample: Sample) -> tuple[np.ndarray, bool]:
-        """Return the values that were usable when the sample was published, and whether there was any."""
+    def ages(self, sample: Sample) -> np.ndarray:
+        """Return the age of all elements of the model [s], shape (size,); NaN where it is not known."""
+        source, target = self._layout_of(sample)
+        ages = np.full(self._elements.size, np.nan)
+        ages[target] = sample.age.flat[source]
+        return np.where(np.isfinite(ages), ages, np.nan)
+
+    def _layout_of(self, sample: Sample) -> tuple[np.ndarray, np.ndarray]:
         layout = self._layout
         if layout is None or layout[0] is not sample.elements:
             layout = self._layout = sample.elements, self._places(sample.elements)
+        return layout[1]
+
+    def _published(self, sample: Sample) -> tuple[np.ndarray, bool]:
+        """Return the values that were usable when the sample was published, and whether there was any."""
+        places = self._layout_of(sample)
         row = np.empty(self._elements.size)
         values, valid, age = sample.values.flat, sample.valid.flat, sample.age.flat
-        is_any = usable(values, valid, age, *layout[1], self._stale_after, row)
+        is_any = usable(values, valid, age, *places, self._stale_after, row)
         return _unwritable(row), is_any
 
     def _places(self, sent: Elements) -> tuple[np.ndarray, np.ndarray]:

@@ -14,14 +14,13 @@ from gemuco.estimation import fill, recipes
 from gemuco.intervals.region import learned_range
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
-from gemuco.trust.aligned import Aligned
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
 from hal.by_signal import Numbers
 from hal.clock import Clock
 from hal.config import RobotConfig
 from services.errors import BadArguments
-from services.model.estimation import Distrust, Freshness, in_order
+from services.model.estimation import Distrust, Freshness, OneTime, in_order
 from services.wire.plain_text import shown
 
 log = logging.getLogger(__name__)
@@ -98,7 +97,7 @@ class Trust:
         self._monitor = TrustMonitor(schema(), config, groups, self._replaces)
         self._rows: list[np.ndarray] = []
         self._last: Numbers | None = None
-        self._aligned, self._hal, self._camera = Aligned(), np.zeros(0), np.zeros(0)
+        self._one_time = OneTime(freshness)
         self._returns = Returns(np.array([name.partition(".")[0] not in robot.seen for name in self._names]))
         self._block = -math.inf
         """This is the number of the last judged block, counted from the zero of the clock."""
@@ -113,8 +112,10 @@ class Trust:
             self._last = self._freshness.measured()[1]
             if self._is_active and self._returns.see(np.isfinite(in_order(schema, self._last).flat), now):
                 self._publish()
-            fresh = self._new_rows(now)
-            self._rows += [schema.scaler.normalise(in_order(schema, row).flat) for row in fresh]
+            for row in self._one_time.rows(now):
+                if self._one_time.is_late:
+                    self._freshness.align(row)
+                self._rows.append(schema.scaler.normalise(in_order(schema, row).flat))
             block = math.floor((now - JUDGED_AT) / BLOCK)
             if block == self._block:
                 return
@@ -130,24 +131,6 @@ class Trust:
             self._returns.judge(self._far(schema) if self._monitor.is_ready else None)
             self._publish()
         self._stop_if_needed()
-
-    def _new_rows(self, now: float) -> list[Numbers]:
-        """Return the samples since the last tick, with the camera's values at the time of the others."""
-        hal, camera = self._freshness.apart()
-        is_new, self._hal = hal.values is not self._hal, hal.values
-        if camera is None:
-            rows = [hal.values] if is_new else []
-        else:
-            if is_new and math.isfinite(hal.time):
-                self._aligned.add(hal.time, hal.values)
-            if camera.values is not self._camera and math.isfinite(camera.time):
-                self._camera = camera.values
-                self._aligned.see(camera.time, camera.values)
-            rows = self._aligned.take(now)
-        taken = [Numbers(row, self._freshness.elements) for row in rows]
-        if camera is not None and taken:
-            self._freshness.align(taken[-1])
-        return taken
 
     def _far(self, schema: BodySchema) -> np.ndarray:
         """Return whether each element is back far from its estimate, shape (size,); not if it cannot be estimated."""

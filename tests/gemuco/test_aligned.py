@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gemuco.trust.aligned import GAP, WAIT, Aligned
+from gemuco.trust.aligned import GAP, SLOW, WAIT, Aligned, Interpolated
 
 SPEED = 2.0
 LATE = 0.05
@@ -61,3 +61,49 @@ def test_nothing_is_interpolated_over_a_gap_and_nothing_goes_back():
     aligned.see(2.25 * GAP, np.array([np.nan, 7.0]))  # repeated
     aligned.see(2.1 * GAP, np.array([np.nan, 7.0]))
     assert aligned.take(2.5 * GAP) == []
+
+
+def held(slow, seconds=4.0, cycle=0.01, ends=np.inf, delay=0.0):
+    """Return times, rows (joint, slow) and delays of a joint that is read every cycle and one that is read slowly."""
+    rows, at, taken = Interpolated(2), 0.0, []
+    for now in np.arange(0.0, seconds, cycle):
+        if now - delay >= at + slow - 1e-9 and now < ends:
+            at = now - delay
+        rows.add(now, np.array([angle(now), angle(at)]), np.array([now, at]))
+        taken += [(time, *row, now - time) for time, row in rows.take(now)]
+    return np.array(taken)
+
+
+def test_a_slow_value_is_interpolated_to_the_time_of_the_others():
+    taken = held(0.1)
+    learned = taken[taken[:, 0] > 1.0]
+    assert len(learned) >= 0.9 * 300
+    assert np.abs(learned[:, 1] - learned[:, 2]).max() < 0.02, "0.2 rad beside a value that is held"
+    assert learned[:, 3].max() <= 0.1 + 1e-9
+    assert (np.diff(taken[:, 0]) > 0.0).all()
+
+
+def test_a_value_that_arrives_late_is_interpolated_too():
+    learned = held(0.08, delay=0.03)
+    learned = learned[learned[:, 0] > 1.0]
+    assert np.abs(learned[:, 1] - learned[:, 2]).max() < 0.02
+    assert learned[:, 3].max() <= 0.12
+
+
+def test_values_of_every_cycle_do_not_wait():
+    taken = held(0.01)
+    assert len(taken) == 400
+    assert (taken[:, 3] == 0.0).all()
+    np.testing.assert_array_equal(taken[:, 1], taken[:, 2])
+    once = held(0.01, ends=3.97)  # three cycles without an answer make nothing slow
+    assert (once[:, 3] == 0.0).all()
+    assert SLOW > 0.02
+
+
+def test_a_slow_value_that_falls_silent_is_missing_and_the_others_go_on():
+    taken = held(0.1, ends=2.0)
+    after = taken[taken[:, 0] > 2.1]
+    assert len(after) >= 140
+    assert np.isnan(after[:, 2]).all()
+    assert np.isfinite(after[:, 1]).all()
+    assert after[:, 3].max() <= WAIT + 0.015

@@ -10,6 +10,7 @@ from gemuco.anomaly.healthy import learn_normal
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Finding, TrustConfig
 from hal.clock import ManualClock
+from hal.config import RobotConfig
 from hal.errors import ConfigError
 from services.errors import BadArguments
 from services.model.estimation import Estimation, Freshness
@@ -50,30 +51,48 @@ class Bench:
     """Freshness, trust and estimation on samples in hand."""
 
     def __init__(
-        self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None, is_known: bool = True
-    ) -> None:
+        self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None, is_known: bool = True,
+        robot: RobotConfig | None = None,
+    ) -> None:  # fmt: skip
         self.clock, self.stops, self.changes = ManualClock(), list[str](), list[float]()
         self.newest: Arrival[Sample] | None = None
-        self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
+        self.freshness = Freshness(robot or arm(), lambda: self.newest, self.clock)
         self.trust = Trust(
-            arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
+            robot or arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
             is_known=lambda schema: is_known, changed=self.changes.append, stops=stops,
         )  # fmt: skip
         self.published: list[Estimates] = []
         self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
         self.cycle = 0
 
-    def feed(self, values: dict[str, np.ndarray]) -> Estimates:
+    def feed(self, values: dict[str, np.ndarray], age: dict[str, float] | None = None) -> Estimates:
+        """Take a sample; `age` [s] is that of all elements of some signals."""
         self.clock.advance(PERIOD)
         self.cycle += 1
         shape = sample_of(0)
+        ages = {name: np.full(len(own), (age or {}).get(name, own[0])) for name, own in shape.age.items()}
         sample = Sample(
-            cycle=self.cycle, boot=7, source="simulated", complete=True, values=values, age=shape.age, valid=shape.valid
+            cycle=self.cycle, boot=7, source="simulated", complete=True, values=values, age=ages, valid=shape.valid
         )
         self.newest = Arrival(sample, self.clock.monotonic())
         self.trust.tick()
         self.estimation.tick()
         return self.published[-1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("slow", ["muscle_tension", "joint_position"])
+def test_a_signal_that_is_read_less_often_hides_nothing_in_motion(slow: str) -> None:
+    """Ten values of it a second, as messages of a car have, beside fifty of the others."""
+    body = arm().model_dump(by_alias=True)
+    body["signals"][slow]["stale_after"] = 0.2
+    bench = Bench(robot=RobotConfig.model_validate(body))
+    held: dict[str, np.ndarray] = {}
+    for number, row in enumerate(motion(3000, 7)[::4]):
+        if number % 5 == 0:
+            held = {slow: row[slow]}
+        bench.feed({**row, **held}, {slow: PERIOD * (number % 5)})
+        assert not bench.freshness.distrust.reasons, f"{number * PERIOD} s: {bench.freshness.distrust.reasons}"
 
 
 @pytest.mark.long
