@@ -131,6 +131,37 @@ def test_a_seed_changes_the_noise_and_the_actual_body_but_not_the_designers(conf
     assert world.measure()["motor_position"][0] == world.measure()["motor_position"][0]
 
 
+@pytest.mark.long
+def test_a_servo_on_a_line_reports_the_load_that_the_body_has(tmp_path: Path) -> None:
+    settings = {"allow_no_watchdog": True, "direction": -1}
+    device = {"kind": "servo", "bus": "arm", "node": 1, "elements": {"position": "angle.a", "load": "load.a"}}
+    config = virtual({
+        "robot": "line",
+        "signals": {"angle": {"unit": "rad", "elements": ["a"]}, "load": {"unit": "1", "elements": ["a"]}},
+        "command": {"signal": "angle", "hold": 1.0},
+        "limits": {"angle": {"low": -1.0, "high": 1.0, "rate": 2.0}},
+        "rates": {"hal": 50},
+        "buses": {"arm": {"interface": "serial", "channel": "line"}},
+        "kinds": {"servo": {"driver": "feetech", "settings": settings}},
+        "devices": {"servo": device},
+    })  # fmt: skip
+    goal = np.array([0.7])
+    world = BenchBody(config, hardware(config), seed=0)
+    world.drive("angle.a", 0.7, True)
+    for _ in range(200):
+        world.step(0.005)
+    rig = body.rig(config, "bench", 0)
+    rig.start()
+    try:
+        with open_robot(config) as robot:
+            sample = cycle_until(robot, arrives("angle", goal, 0.01), goal)
+    finally:
+        rig.stop()
+    load = world.truth()["load"][0]
+    assert abs(load) > 0.1
+    assert sample.values["load"][0] == pytest.approx(load, abs=0.03)
+
+
 def test_a_sensor_that_was_set_keeps_its_value(config: RobotConfig) -> None:
     rig = Rig(config, BenchBody(config, hardware(config), seed=0), hardware(config))
     rig.fault("set force.tip 17")

@@ -36,6 +36,8 @@ class SerialConstants:
         stiffness: Share of its largest drive per radian of lag [1/rad].
         stall_current: Current at the largest drive [A].
         has_dead_watchdog: Whether its watchdog reports a stop that it does not perform.
+        load: `signal.element` of the load or current that it carries; None: its drive follows from its lag alone.
+        full_load: Value of that element at the largest drive [its unit].
     """
 
     kind: ClassVar[str] = "serial_servo"
@@ -53,6 +55,8 @@ class SerialConstants:
     stiffness: float = 8.0
     stall_current: float = 2.4
     has_dead_watchdog: bool = False
+    load: str | None = None
+    full_load: float = 1.0
 
     @property
     def unit(self) -> float:
@@ -142,10 +146,15 @@ class SerialNode(SimulatedNode, SimulatedDrive, abc.ABC):
 
     @property
     def drive(self) -> float:
-        """Share of the largest drive, with sign."""
-        if not self.is_on:
+        """Share of the largest drive, with sign; a load is carried, by a brake if the torque is off."""
+        constants = self.constants
+        if constants.load is not None:
+            share = constants.direction * self.plant.read(constants.load) / constants.full_load
+        elif self.is_on:
+            share = constants.stiffness * (self._target - self.angle)
+        else:
             return 0.0
-        return max(-1.0, min(1.0, self.constants.stiffness * (self._target - self.angle)))
+        return max(-1.0, min(1.0, share))
 
     def is_deaf(self, now: float) -> bool:
         """Whether it does not listen at present: no supply, or busy with its memory."""

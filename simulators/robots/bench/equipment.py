@@ -1,6 +1,6 @@
 """For each device of a robot file the node that answers in its place, with the constants that the file claims."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -124,6 +124,13 @@ def _dynamixel(settings: Any) -> Constants:
     )
 
 
+def _loaded(constants: SerialConstants, elements: Mapping[str, str]) -> SerialConstants:
+    """Return a servo that carries the load, or else has the current, of its device."""
+    if "load" in elements:
+        return replace(constants, load=elements["load"], full_load=1.0)
+    return replace(constants, load=elements.get("current"), full_load=constants.stall_current)
+
+
 CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia401": _cia401,
     "cia402": _cia402,
@@ -169,6 +176,8 @@ def hardware(config: RobotConfig) -> list[NodeSpec]:
             constants = replace(constants, more=_more(settings, device.elements))
         if isinstance(constants, DriveConstants):
             constants = replace(constants, load=device.elements.get("effort"))
+        elif isinstance(constants, SerialConstants):
+            constants = _loaded(constants, device.elements)
         sheet = config.folder / settings.eds if hasattr(settings, "eds") else None
         nodes.append(NodeSpec(name, device.bus, device.node, element, constants, sheet))
     return nodes

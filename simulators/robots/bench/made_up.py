@@ -14,6 +14,7 @@ from hal.protocols import dbc
 from simulators.nodes.canopen.analog_input import AnalogConstants
 from simulators.nodes.canopen.spec import DriveConstants, EncoderConstants, NodeSpec
 from simulators.nodes.dbc.sensor import DbcConstants
+from simulators.nodes.serial.node import SerialConstants
 from simulators.robots.bench.world import BenchWorld
 
 SPANS = {"rad": 0.5, "rad/s": 1.0, "m": 0.1, "m/s": 1.0, "N": 20.0, "N m": 1.0, "degC": 20.0, "V": 5.0, "A": 2.0}
@@ -160,6 +161,9 @@ def _followers(config: RobotConfig, node: NodeSpec) -> Iterator[tuple[str, tuple
         if constants.load is not None:
             largest = constants.rated_torque * constants.gear / (constants.spool_radius or 1.0)
             yield constants.load, (0.0, USED * largest)
+    elif isinstance(constants, SerialConstants):
+        if constants.load is not None:
+            yield constants.load, (0.0, USED * constants.full_load)
     elif isinstance(constants, AnalogConstants):
         for element in (node.element, *filter(None, constants.more)):
             yield element, (0.0, USED * constants.full_scale)
