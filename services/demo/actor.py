@@ -51,6 +51,15 @@ class Stage:
     observed: bool
 
 
+def hal_works(client: Client) -> bool:
+    """Whether the HAL runs; one that is degraded does if all of its devices answer, as servos without a watchdog do."""
+    status = client.status("hal")
+    if status is None or status.state == "running":
+        return status is not None
+    sample = client.sample() if status.state == "degraded" else None
+    return sample is not None and sample.complete and all(valid.all() for valid in sample.valid.values())
+
+
 class Actor:
     """Client program that moves the robot of a story."""
 
@@ -74,9 +83,9 @@ class Actor:
             if time.monotonic() > deadline:
                 raise NotFollowing(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
             try:
-                if self._mode() == "fault" or not self._is_healthy():
+                if self._mode() == "fault" or not hal_works(self._client):
                     self._client.reset()
-                    self.wait(lambda: self._mode() == "off" and self._is_healthy(), ENGAGED_WITHIN)
+                    self.wait(lambda: self._mode() == "off" and hal_works(self._client), ENGAGED_WITHIN)
                 self._client.engage()
             except (NotEngaged, CommandRefused, NoAnswer) as error:
                 refusal = str(error)
@@ -201,10 +210,6 @@ class Actor:
                 time.sleep(AGAIN)
             else:
                 return
-
-    def _is_healthy(self) -> bool:
-        status = self._client.status("hal")
-        return status is not None and status.state == "running"
 
     def _follows(self) -> bool:
         return self._mode() in ("hold", "follow")

@@ -20,7 +20,7 @@ from hal.robot import open_robot
 from services import show
 from services.client import Client
 from services.demo import pace, report
-from services.demo.actor import Actor, NotFollowing
+from services.demo.actor import Actor, NotFollowing, hal_works
 from services.demo.live_view import Play, Screen, waiting
 from services.demo.page import playing_along
 from services.demo.report import CLIENT, Ending
@@ -315,6 +315,8 @@ def _is_running(client: Client, name: str) -> bool:
 
     Before it has learned what is normal on this body it may suspect one for as long as the arm rests.
     """
+    if name == "hal":
+        return hal_works(client)
     status = client.status(name)
     if status is None:
         return False

@@ -5,8 +5,10 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -244,19 +246,23 @@ def test_a_process_that_ended_is_named_before_what_it_did_not_answer(
         ("model", "running", True, True),
         ("model", "degraded", True, True),
         ("model", "degraded", False, False),
-        ("hal", "degraded", True, False),
+        ("hal", "running", False, True),
+        ("hal", "degraded", True, True),  # servos without a watchdog answer, and it says so for good
+        ("hal", "degraded", False, False),
+        ("hal", "fault", True, False),
         ("model", None, True, False),
     ],
 )
-def test_a_model_that_suspects_a_sensor_of_an_unknown_body_runs(
-    name: str, state: str | None, estimates: bool, runs: bool
-) -> None:
+def test_a_degraded_service_that_does_its_work_runs(name: str, state: str | None, estimates: bool, runs: bool) -> None:
     class Publishing:
         def status(self, service: str) -> Status | None:
             return None if state is None else Status(service=service, state=state, text="a sensor is suspected")
 
         def estimate(self) -> object:
             return object() if estimates else None
+
+        def sample(self) -> SimpleNamespace:
+            return SimpleNamespace(complete=estimates, valid={"joint_position": np.array([True])})
 
     assert demo._is_running(Publishing(), name) == runs  # type: ignore[arg-type]
 

@@ -320,6 +320,9 @@ class Lost(Stopping):
     def status(self, service: str, timeout: float = 0.0) -> Status:
         return Status(service="hal", state="running" if self.resets > 1 else "degraded")
 
+    def sample(self) -> None:
+        return None
+
     def reset(self) -> None:
         super().reset()
         self.resets += 1
