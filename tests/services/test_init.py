@@ -71,8 +71,8 @@ def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
         (tmp_path / "vendors" / Path(name).name).write_bytes((ROOT / "robots" / name).read_bytes())
     completed = gemuco(tmp_path, "init", "vendors")
     assert completed.returncode == 0, completed.stderr
-    assert completed.stdout.startswith("vendors.yaml: devices: 2, of them drives: 1, elements: 3; lines to set: 3.\n")
-    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco simulate vendors.yaml" in completed.stdout
+    assert completed.stdout.startswith("vendors.yaml: devices: 2, of them drives: 1, elements: 5; lines to set: 3.\n")
+    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco demo vendors.yaml" in completed.stdout
     robot = load_robot(tmp_path / "vendors.yaml")
     assert sorted(robot.devices) == ["cell", "servo_drive"]
     again = gemuco(tmp_path, "init", "vendors")
