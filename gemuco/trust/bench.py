@@ -183,13 +183,16 @@ class Bench:
     def under_proposed(self, hidden: Hidden, evidence: Evidence) -> float:
         """Return the largest evidence if the model's own p holds since the most likely change, or all the time.
 
-        Only measured columns count: normal errors that were learned with one tool take its p for certain. A tool that
-        was changed long ago has errors that may be taken for healthy by now; then nothing changed lately, and the right
-        p is known by its much smaller errors.
+        Of the p of a trained tool only measured columns count: normal errors that were learned with one tool take its p
+        for certain. A tool that was changed long ago has errors that may be taken for healthy by now; then nothing
+        changed lately, and the right p is known by its much smaller errors. Another p may be that of a lie.
         """
         proposed = self.tool.proposed
         assert proposed is not None
         alternatives, measured = self.alternatives(hidden - self.environment), slice(self.relations.count)
+        trained = np.array(list(proposed.biases.values()))
+        if not len(trained) or is_another(proposed, proposed.bias, trained).all():
+            return alternatives.under(proposed, evidence.newest).highest
         since = alternatives.under(proposed, evidence.newest, measured)
         always, share = alternatives.always(proposed, measured)
         return min(since.highest_of(measured), always.highest_of(measured) if share < FAR_BETTER else np.inf)

@@ -87,7 +87,7 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
 
 
 def test_a_robot_without_a_story_is_told_so_before_anything_starts(tmp_path: Path) -> None:
-    control = {"control": {"target": "joint_position"}}
+    control = {"control": {"target": "tool_tip_position"}}
     for changes, sentence in (({}, "no model.control section"), ({"model": control, "conditions": []}, "no story for")):
         with pytest.raises(ConfigError, match=sentence):
             demo.play(config("untold", **changes), tmp_path / "untold.yaml", 1, tmp_path)
