@@ -186,6 +186,22 @@ def test_contradictory_messages_are_left_out_and_said(tmp_path: Path) -> None:
     assert any(note.startswith("'unit.dbc': Twice, Long left out") and "overlapping" in note for note in draft.notes)
 
 
+def test_a_drive_with_fixed_pdos_measures_what_these_carry(tmp_path: Path) -> None:
+    """Its RPDO has the mode of operation too, which the driver may send."""
+    fixed = {"1600": (0x60400010, 0x60600008, 0x607A0020), "1A00": (0x60410010, 0x60640020, 0x60770010)}
+    text = DRIVE
+    for index in (*(f"160{n}" for n in range(4)), *(f"1A0{n}" for n in range(4))):
+        entries = fixed.get(index, ())
+        for place, value in enumerate((len(entries), *entries, *(0,) * (8 - len(entries)))):
+            text = with_lines(text, f"{index}sub{place:X}", AccessType="ro", DefaultValue=str(value))
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "drive.eds").write_text(text)
+    file = written(draft_folder(tmp_path / "files", "arm", tmp_path, SHIPPED), tmp_path)
+    assert set(load_robot(file).devices["drive"].elements) == {"position", "effort"}
+    with running(virtual(body_of(file))) as (robot, _):
+        assert states(robot) == {"drive": "ready"}
+
+
 def dbc_of(*messages: tuple[int, str], size: int = 8, sender: str = "X") -> str:
     """Return a DBC file of messages with one signal each."""
     lines = (f'BO_ {number} {name}: {size} {sender}\n SG_ {name} : 0|16@1+ (0.01,0) [0|600] "N" X\n'

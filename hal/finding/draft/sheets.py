@@ -7,7 +7,7 @@ from typing import Any
 import canopen
 
 from hal.commissioning.pdo_map import check_map, chosen_pdos, is_fixed
-from hal.drivers.cia402.settings import DriveSettings
+from hal.drivers.cia402 import Cia402Drive
 from hal.errors import ConfigError
 from hal.finding.draft.parts import Measure, Names, Part
 from hal.protocols import cia301, cia402
@@ -135,12 +135,12 @@ def _measured(sheet: Sheet, settings: dict[str, Any], own: str, moved: str) -> t
         Measure("effort", f"{part}_effort", own, "N m"),
         Measure("velocity", f"{part}_velocity", own, "rad/s"),
     )
-    drive = DriveSettings.model_validate(settings)
+    drive = Cia402Drive.Settings.model_validate(settings)
     for count in range(len(measures), 1, -1):
         pdos = drive.pdos(tuple(measure.quantity for measure in measures[:count]))
         try:
             if is_fixed(sheet.dictionary):
-                pdos = chosen_pdos(sheet.dictionary, pdos, (), own)
+                pdos = chosen_pdos(sheet.dictionary, pdos, Cia402Drive.MAY_RECEIVE, own)
             check_map(pdos, sheet.dictionary, own)
         except ConfigError:
             continue
