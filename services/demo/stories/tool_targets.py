@@ -14,6 +14,8 @@ INSIDE = 0.1
 """The distance of postures from the limits is at least this share of the range."""
 TRIED = 3000
 """At most this many postures are tried as a target."""
+STARTS = 10
+"""Targets are drawn from at most this many first ones: not every one has enough others near it."""
 CLOSE = 0.02
 """A posture with the other tool must reach a target with at most this error [unit of the target]."""
 APART = (0.08, 0.25)
@@ -42,15 +44,24 @@ def common_targets(
     """
     random = np.random.default_rng(seed)
     (postures, first), (_, second) = (_reached(robot, signal, condition, random) for condition in conditions)
-    order = random.permutation(len(first))[:TRIED]
-    chosen: list[int] = []
-    for _ in range(count):
-        chosen.append(_next(order, first, second, chosen))
-    return first[chosen], postures[chosen]
+    most = 0
+    for _ in range(STARTS):
+        order = random.permutation(len(first))[:TRIED]
+        chosen: list[int] = []
+        while len(chosen) < count and (index := _next(order, first, second, chosen)) is not None:
+            chosen.append(index)
+        if len(chosen) == count:
+            return first[chosen], postures[chosen]
+        most = max(most, len(chosen))
+    raise NowhereToGo(
+        f"Only {most} of {count} targets near one another are reached with both tools, by the forecast of the robot "
+        "file's 'collect' section. Widen collect.constraints, or order `conditions` so that the first and the last "
+        "reach the same places."
+    )
 
 
-def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list[int]) -> int:
-    """Return the first index in `order` that is new, near the last chosen target, and reached by both tools."""
+def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list[int]) -> int | None:
+    """Return the first index in `order` that is new, near the last chosen target, and reached by both tools, if any."""
     least, largest = APART
     for index in order:
         away = np.linalg.norm(first[chosen] - first[index], axis=1)
@@ -58,11 +69,7 @@ def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list
             continue
         if len(second) and np.linalg.norm(second - first[index], axis=1).min() <= CLOSE:
             return int(index)
-    raise NowhereToGo(
-        f"No {len(chosen) + 1} targets near one another are reached with both tools, by the forecast of the robot "
-        "file's 'collect' section. Widen collect.constraints, or order `conditions` so that the first and the last "
-        "reach the same places."
-    )
+    return None
 
 
 def _reached(
