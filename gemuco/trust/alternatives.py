@@ -25,6 +25,8 @@ APART = 2.0
 """The values of both differ by this much [healthy errors]; else any lie of one would do as the other's value."""
 OTHER_TOOL = 0.2
 """Another tool or load is one whose p differs by this share of the range of the trained ones."""
+EVERY = slice(None)
+"""All columns."""
 
 
 class Alternatives:
@@ -46,9 +48,19 @@ class Alternatives:
     def _now(self) -> View:
         return self._recent.view(self._relations, self._hidden)
 
-    def under(self, schema: BodySchema, age: int) -> Evidence:
-        """Return the evidence if the p of a schema holds since about `age` blocks."""
-        return self._since(self._recent.under(schema, self._relations), age)
+    def under(self, schema: BodySchema, age: int, columns: slice = EVERY) -> Evidence:
+        """Return the evidence if the p of a schema holds since about `age` blocks, for the age that leaves least in
+        some columns.
+        """
+        return self._since(self._recent.under(schema, self._relations), age, columns=columns)
+
+    def always(self, schema: BodySchema, columns: slice) -> tuple[Evidence, float]:
+        """Return the evidence if the p of a schema held in all of the newest blocks, and the errors of some columns
+        relative to those of the model in use (root mean squares).
+        """
+        view = self._recent.under(schema, self._relations).view(self._relations, self._hidden)
+        other, now = (float(np.sqrt(np.nanmean(each.z[:, columns] ** 2))) for each in (view, self._now))
+        return self._judge(view), other / now if now > 0.0 else 1.0
 
     def exchanges(self, evidence: Evidence) -> Iterator[tuple[Hidden, Evidence]]:
         """Yield pairs of elements of one signal with much evidence, and the evidence if they are exchanged back."""
@@ -80,15 +92,15 @@ class Alternatives:
         view = self._recent.exchanged(self._schema, self._relations, *pair).view(self._relations, self._hidden)
         return self._mixed(view, since) if since < LONGEST else self._judge(view)
 
-    def _since(self, other: Recent, age: int, most: int = LONGEST) -> Evidence:
-        """Return the least evidence if the errors are those of other blocks since about `age` blocks.
+    def _since(self, other: Recent, age: int, most: int = LONGEST, columns: slice = EVERY) -> Evidence:
+        """Return the evidence if the errors are those of other blocks since about `age` blocks.
 
-        At most this number of ages is tried.
+        At most `most` ages are tried; it is that of the age that leaves least evidence in some columns.
         """
         place, view = AGES.index(age), other.view(self._relations, self._hidden)
         first, last = AGES[max(place - 1, 0)], min(AGES[min(place + 1, len(AGES) - 1)], LONGEST - 1)
         changed = [self._mixed(view, since) for since in range(first, last + 1, 1 + (last - first) // most)]
-        return min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
+        return min(changed, key=lambda evidence: evidence.highest_of(columns))
 
     def _mixed(self, other: View, since: int) -> Evidence:
         z = np.concatenate([self._now.z[:-since], other.z[-since:]])

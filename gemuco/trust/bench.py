@@ -30,6 +30,8 @@ BLAMED = 0.8
 DOUBTFUL, PLAIN, AMONG = 0.4, 1.5, 0.5
 """From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
 second multiple of an alarm. One of them has at least the third share of the largest evidence."""
+FAR_BETTER = 0.2
+"""A p that held all the time has errors of at most this share of those of the p so far."""
 
 
 class Bench:
@@ -179,10 +181,21 @@ class Bench:
                 yield name, alternatives.under(other, age), self._is_known(other)
 
     def under_proposed(self, hidden: Hidden, evidence: Evidence) -> float:
-        """Return the largest evidence if the model's own p holds since the most likely change."""
-        assert self.tool.proposed is not None
-        other = self.alternatives(hidden - self.environment).under(self.tool.proposed, evidence.newest)
-        return other.highest
+        """Return the largest evidence if the model's own p holds since the most likely change, or all the time.
+
+        Of the p of a trained tool only measured columns count: normal errors that were learned with one tool take its p
+        for certain. A tool that was changed long ago has errors that may be taken for healthy by now; then nothing
+        changed lately, and the right p is known by its much smaller errors. Another p may be that of a lie.
+        """
+        proposed = self.tool.proposed
+        assert proposed is not None
+        alternatives, measured = self.alternatives(hidden - self.environment), slice(self.relations.count)
+        trained = np.array(list(proposed.biases.values()))
+        if not len(trained) or is_another(proposed, proposed.bias, trained).all():
+            return alternatives.under(proposed, evidence.newest).highest
+        since = alternatives.under(proposed, evidence.newest, measured)
+        always, share = alternatives.always(proposed, measured)
+        return min(since.highest_of(measured), always.highest_of(measured) if share < FAR_BETTER else np.inf)
 
     def sudden(self, age: int) -> Hidden:
         """Return the columns that jumped within about the newest `age` blocks while all others moved as usual."""

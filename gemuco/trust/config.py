@@ -41,7 +41,8 @@ class Finding:
         is_distrusted: Whether the elements are hidden; if not, they are suspected and still used.
         by_hand: Whether an operator decided.
         reason: Why they are still used, if a rule forbids to hide them; else empty.
-        is_gross: Whether the evidence is much more than an alarm, and all others fit each other.
+        is_gross: Whether the evidence is much more than an alarm, and all others fit each other; with a tool or load
+            that explained all sensors before.
         condition: The trained condition whose p explains what is seen, if the cause is the environment; else empty.
     """
 

@@ -51,7 +51,11 @@ class Evidence:
     @property
     def highest(self) -> float:
         """Largest evidence against any column."""
-        return float(self.ratio.max(initial=0.0))
+        return self.highest_of(slice(None))
+
+    def highest_of(self, columns: slice) -> float:
+        """Return the largest evidence against some columns."""
+        return float(self.ratio[columns].max(initial=0.0))
 
     @property
     def newest(self) -> int:

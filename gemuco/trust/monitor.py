@@ -107,7 +107,7 @@ class TrustMonitor:
         self._known = bench = None if relations is None else Bench(self._tool, relations, self._config)
         if relations is None or bench is None:
             return
-        self._other = self._motion = self._alarmed = self._calm = 0.0
+        self._other = self._motion = self._alarmed = 0.0
         self._search, self._missing = LastSearch(), Hidden()
         self._jumped: Hidden | None = None
         """The columns that jumped when the alarm that lasts began, and since, if any did; None without an alarm."""
@@ -137,7 +137,7 @@ class TrustMonitor:
         if any(case.is_hidden and case.changes(columns, self._parts) for case in self._cases):
             return False
         has_moved = bench.tool.seen_for(bench.healthy.moved) >= MOVED
-        return (self.is_known or self._calm >= ACQUAINTED) and has_moved and bench.is_known_tool
+        return (self.is_known or bench.tool.calm >= ACQUAINTED) and has_moved and bench.is_known_tool
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -187,7 +187,7 @@ class TrustMonitor:
             self._decide(evidence, hidden, is_steady)
         self._other = self._other + motion if any(c.cause.cause == "body" for c in self._cases) else 0.0
         is_quiet = evidence.highest < LEARNING
-        self._calm += motion * (evidence.highest < CALM and evidence.level < STRANGE and not hidden)
+        bench.tool.calm += motion * (evidence.highest < CALM and evidence.level < STRANGE and not hidden)
         if not bench.healthy.is_known or is_quiet or self._other > OTHER:
             bench.learn(evidence, motion)
         if bench.tool.proposed is not None and self._believes_tool(evidence, hidden):
@@ -447,4 +447,4 @@ class TrustMonitor:
     def _finding(self, case: Case) -> Finding:
         bench = self._bench
         at = sorted(self._at(case), key=lambda p: (bench.place[p] != case.cause.lead, p))
-        return case.finding(at, since=self._now - (self._count - case.began) * BLOCK)
+        return case.finding(at, self._now - (self._count - case.began) * BLOCK, bench.tool.has_explained)

@@ -5,6 +5,9 @@ import numpy as np
 from gemuco.schema import BodySchema
 from gemuco.trust.alternatives import is_another
 
+EXPLAINS = 5.0
+"""A tool or load explains all sensors if none was contradicted in this number of blocks of motion."""
+
 
 class JudgedTool:
     """The model that sensors are judged by: newest W, and p of the tool or load that is believed to be in use.
@@ -15,13 +18,15 @@ class JudgedTool:
     Attributes:
         schema: The model.
         proposed: The newest model, if its p is another number; else None.
+        calm: Motion in which no sensor was contradicted [blocks at the usual pace].
     """
 
     def __init__(self, schema: BodySchema) -> None:
         """Begin with a model and its p."""
         self.schema = self._newest = schema
         self.proposed: BodySchema | None = None
-        self._met, self._met_at = schema.bias, 0.0
+        self._met, self._met_at, self._met_calm = schema.bias, 0.0, 0.0
+        self.calm = 0.0
 
     def propose(self, schema: BodySchema) -> None:
         """Judge by the W of the newest model, and by its p once it is accepted."""
@@ -36,7 +41,12 @@ class JudgedTool:
         """Judge by the proposed p from now on; `moved` is the motion so far [blocks at the usual pace]."""
         self.schema, self.proposed = self._newest, None
         if is_another(self.schema, self.schema.bias, self._met[None])[0]:
-            self._met, self._met_at = self.schema.bias, moved
+            self._met, self._met_at, self._met_calm = self.schema.bias, moved, self.calm
+
+    @property
+    def has_explained(self) -> bool:
+        """Whether this tool or load explained all sensors for a while; one that never did may be a wrong one."""
+        return self.calm - self._met_calm >= EXPLAINS
 
     @property
     def is_another(self) -> bool:

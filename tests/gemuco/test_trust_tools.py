@@ -83,6 +83,37 @@ def test_another_tool_is_named_and_no_sensor_is_hidden_for_it(model, seed):
     assert "long" in named
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.long
+def test_sensors_are_judged_by_the_tool_that_an_update_recognises_long_after_the_change(model, seed):
+    """Errors with the wrong tool may be taken for healthy by then, and only one tool was ever normal."""
+    position, change, recognised = walk(CHANGE + 170, 80 + seed), CHANGE * SAMPLES, CHANGE + 150
+    rows = np.r_[body(position[:change], TOOLS["short"]), body(position[change:], TOOLS["long"])]
+    monitor = TrustMonitor(model)
+    for number, block in enumerate(model.scaler.normalise(rows).reshape(-1, SAMPLES, LAYOUT.size)):
+        if number == recognised:
+            monitor.use(model.under("long"))
+        monitor.add(block, number * BLOCK)
+        if number == recognised + 10:
+            np.testing.assert_array_equal(monitor._bench.schema.bias, model.under("long").bias)
+
+
+def test_no_lie_is_gross_before_the_tool_has_explained_all_sensors(model):
+    """An update learns from no sample while a lie is gross, so a wrong p could never be mended."""
+    monitor, rows = TrustMonitor(model), body(walk(400, 90), TOOLS["short"])
+    case = Case(Cause(frozenset({0}), "element", 0), 1, 1, 1, is_gross=True)
+    seen = []
+    for number, block in enumerate(model.scaler.normalise(rows).reshape(-1, SAMPLES, LAYOUT.size)):
+        monitor.add(block, number * BLOCK)
+        seen.append(monitor._finding(case).is_gross)
+        if number == CHANGE:
+            monitor._bench.tool.propose(model.under("long"))
+            monitor._bench.tool.accept(monitor._bench.healthy.moved)
+            assert not monitor._finding(case).is_gross, "another tool has explained nothing yet"
+    assert not any(seen[:5])
+    assert all(seen[CHANGE - 20 : CHANGE])
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.long
 def test_an_encoder_that_lies_is_not_taken_for_a_tool(model, seed):
