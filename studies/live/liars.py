@@ -48,6 +48,8 @@ SIZES = (0.1, 0.3, 1.0)
 LIES, HEALTHY = ("offset", "frozen", "drift"), ("none", "tool", "strange")
 SOON = 2.0
 """A lie is to be hidden within this time [s]."""
+WRONG = 0.05
+"""A lie begins when its value is first wrong by this much [rad]: a frozen encoder of a joint at rest is right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +60,10 @@ class Play:
         kind: What happens.
         liar: The lying element; empty if none lies.
         size: Size of the lie [rad].
-        delay: Time from its beginning until the liar was hidden [s]; NaN if it never was.
+        delay: Time from the event until the liar was hidden [s]; NaN if it never was.
         wrong: Right elements that were hidden at some time.
         stayed: Those that were hidden at the end.
+        began: Time from the event until the value was wrong by `WRONG` [s]; NaN if it never was.
     """
 
     kind: str
@@ -69,6 +72,7 @@ class Play:
     delay: float
     wrong: frozenset[str]
     stayed: frozenset[str]
+    began: float = 0.0
 
 
 def motion(robot: RobotConfig, condition: str, seed: int, seconds: float) -> np.ndarray:
@@ -102,6 +106,8 @@ def play(robot: RobotConfig, schema: BodySchema, kind: str, seed: int, learns: b
         "frozen": np.full_like(lying, lying[0]),
         "drift": lying + sign * size * np.minimum(np.arange(len(lying)) * STEP / 2.0, 1.0),
     }.get(kind, lying)
+    is_wrong = np.abs(shown - true)[:, joint] >= WRONG
+    began = float(is_wrong.argmax() * STEP - begin) if is_wrong.any() else np.nan
     service = LiveService(robot, schema.under(believed if learns else condition))
     if learns:
         service.model.update.adapt(True)
@@ -113,7 +119,7 @@ def play(robot: RobotConfig, schema: BodySchema, kind: str, seed: int, learns: b
         hidden = frozenset(service.model.freshness.distrust.reasons)
         delay = time - begin if np.isnan(delay) and liar in hidden and time >= begin else delay
         wrong |= hidden - {liar}
-    return Play(kind, liar, size, delay, wrong, hidden - {liar})
+    return Play(kind, liar, size, delay, wrong, hidden - {liar}, began)
 
 
 def arrivals(joints: np.ndarray, tip: np.ndarray, end: float) -> Iterator[tuple[float, dict[str, np.ndarray], float]]:
@@ -137,17 +143,18 @@ def model_of(name: str) -> BodySchema:
 
 
 def row_of(kind: str, played: list[Play]) -> tuple[str, ...]:
-    """Return the row of one kind."""
-    delays = np.array([one.delay for one in played if one.delay == one.delay])
+    """Return the row of one kind; plays of a lie in which the value was never wrong do not count."""
     is_lie = kind in LIES
+    counted = [play for play in played if not is_lie or play.began == play.began]
+    delays = np.array([max(0.0, play.delay - play.began) for play in counted if play.delay == play.delay])
     return (
         kind,
-        str(len(played)),
+        str(len(counted)),
         f"{len(delays)}" if is_lie else "-",
         f"{(delays <= SOON).sum()}" if is_lie else "-",
         f"{np.median(delays):.1f} s" if len(delays) else "-",
-        str(sum(bool(one.wrong) for one in played)),
-        str(sum(bool(one.stayed) for one in played)),
+        str(sum(bool(play.wrong) for play in counted)),
+        str(sum(bool(play.stayed) for play in counted)),
     )
 
 

@@ -3,7 +3,9 @@
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import numpy as np
+import zenoh
 
 from gemuco import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
@@ -13,7 +15,7 @@ from services.model import update_loop
 from services.model.gemuco_service import GemucoService
 from services.process.service import Service
 from services.wire import keys
-from services.wire.messages import Message, Sample
+from services.wire.messages import Applied, Message, Sample, Update
 from services.wire.streams import Arrival
 
 STEP_COST = 2e-3
@@ -31,11 +33,13 @@ class Wire:
         self.arrivals: dict[str, Arrival[Any]] = {}
         self.published: dict[str, Message] = {}
         nothing = SimpleNamespace(handler=SimpleNamespace(try_recv=lambda: None))
-        self.session = SimpleNamespace(declare_subscriber=lambda *_: nothing)
+        done = SimpleNamespace(attachment=None, payload=zenoh.ZBytes(msgspec.msgpack.encode({"ok": {}})))
+        answer = SimpleNamespace(ok=done)
+        self.session = SimpleNamespace(declare_subscriber=lambda *_: nothing, get=lambda *_, **__: [answer])
 
     def newest(self, key: str, record: type[Message]) -> Any:
         """Return a reader of a key; see `Service.newest`."""
-        return SimpleNamespace(last=lambda: self.arrivals.get(key), get=lambda age: None)
+        return SimpleNamespace(last=lambda: self.arrivals.get(key), get=lambda age: self._message(key))
 
     def publisher(self, key: str, record: type[Message]) -> Any:
         """Return a publisher of a key; see `Service.publisher`."""
@@ -43,6 +47,10 @@ class Wire:
 
     def watch(self, *activities: object) -> None:
         """Watch nothing."""
+
+    def _message(self, key: str) -> Message | None:
+        arrival = self.arrivals.get(key)
+        return None if arrival is None else arrival.message
 
 
 class LiveService:
@@ -84,6 +92,27 @@ class LiveService:
     def camera(self, values: dict[str, np.ndarray], age: float) -> None:
         """Let a sample of the camera arrive now; its values were true a time [s] ago."""
         self._arrive(keys.vision(self._robot.robot), "camera", values, age)
+
+    def follow(self) -> None:
+        """Let the HAL publish that the drives follow, so that the controller may be engaged."""
+        signal = self._robot.command.signal
+        nothing = np.full(self._robot.signals[signal].size, np.nan)
+        applied = Applied(
+            cycle=0, mode="follow", signal=signal, desired=nothing, values=nothing, limited_by=[], sender=0
+        )
+        self._wire.arrivals[keys.applied(self._robot.robot)] = Arrival(applied, self._clock.monotonic())
+
+    @property
+    def command(self) -> np.ndarray | None:
+        """Newest command of the controller [its unit], shape (n,); None before the first."""
+        command: Any = self._wire.published.get(keys.command(self._robot.robot))
+        return None if command is None else np.asarray(command.values, float)
+
+    @property
+    def updated(self) -> Update:
+        """Newest state of the online update."""
+        state: Any = self._wire.published[keys.update(self._robot.robot)]
+        return state
 
     def _arrive(self, key: str, source: str, values: dict[str, np.ndarray], age: float) -> None:
         self._numbers[source] += 1

@@ -1,5 +1,7 @@
 """The model service in simulated time: its loops keep their rates, and a play of a lie has a result."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from hal.config import load_robot
 from simulators.robots.pr2_duster.body import tool_tip
 from simulators.robots.pr2_duster.duster import GRASPS
 from studies.accuracy.lies import Body
-from studies.live import bodies
+from studies.live import bodies, liars, tools
 from studies.live.liars import JOINTS, TIP, arrivals, motion
 from studies.live.service import LiveService
 
@@ -72,3 +74,16 @@ def test_lies_of_recorded_motion_are_played_to_the_service(model: BodySchema, ki
     assert np.isnan(outcome.delay) and not outcome.wrong
     assert outcome.size > 0.0
     assert len(given) == 2 * 2 * bodies.RATE - bodies.LATE, "the camera's values come late"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_changed_tool_is_recognised_and_no_right_sensor_is_hidden(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(liars, "CACHE", tmp_path)
+    robot = load_robot("robots/pr2_duster.yaml")
+    schema = liars.model_of("pr2_duster")
+    for number in range(3):
+        play = tools.play(robot, schema, 1, tools.SHIFT * number)
+        assert not play.hidden and not play.stops
+        assert play.recognised(robot.conditions[-1]), play
+        assert play.tools[0][0] == robot.conditions[0]
