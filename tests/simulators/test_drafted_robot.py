@@ -153,6 +153,20 @@ def test_files_without_a_drive_have_one_that_stands_in(tmp_path: Path) -> None:
     assert any("Pull, Rate have no unit that is known" in note for note in draft.notes)
 
 
+def test_a_data_sheet_that_an_earlier_draft_copied_is_no_device(tmp_path: Path) -> None:
+    (tmp_path / "cells.dbc").write_text(SENSOR)
+    first = draft_folder(tmp_path, "cells", tmp_path, SHIPPED)
+    written(first, tmp_path)
+    sheet = tmp_path / "eds" / "servo_drive.eds"
+    assert sheet.exists(), "a drive stands in for one"
+    again = draft_folder(tmp_path, "cells", tmp_path, SHIPPED)
+    assert load_robot(written(again, tmp_path)) == load_robot(written(first, tmp_path))
+    assert any("'eds/servo_drive.eds' was copied there by an earlier draft" in note for note in again.notes)
+    sheet.write_text(sheet.read_text() + "\n")
+    other = draft_folder(tmp_path, "cells", tmp_path, SHIPPED)
+    assert "stand_in" not in other.text, "a file with another content is the user's"
+
+
 def test_a_drive_keeps_off_the_identifiers_of_a_dbc_file(tmp_path: Path) -> None:
     """Node 1 would send 081h, 181h and 581h, which are messages of the file."""
     (tmp_path / "files").mkdir()

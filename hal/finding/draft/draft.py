@@ -76,6 +76,15 @@ class _Draughtsman:
         self.copies[f"{kind}/{name}"] = self.shipped / kind / name
         return f"{kind}/{name}"
 
+    def is_copy(self, path: Path) -> bool:
+        """Whether a file was copied beside the robot file by an earlier draft, so that it describes no own device."""
+        place = self.path_of(path)
+        original = self.shipped / place
+        is_copy = place.count("/") == 1 and original.is_file() and original.read_bytes() == path.read_bytes()
+        if is_copy:
+            self.notes.append(f"Left out: '{place}' was copied there by an earlier draft.")
+        return is_copy
+
     def node(self, wish: int | None, first: int) -> int:
         """Return a node id that no other device has: the wished one, or the next from `first` on.
 
@@ -120,6 +129,7 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
             "MJCF file."
         )
     work = _Draughtsman(folder, shipped)
+    files = [path for path in files if not work.is_copy(path)]
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(sheet.profile == 406 for sheet in known)
     work.waiting += sum(not sheet.node for sheet in known)
@@ -154,7 +164,7 @@ def draft_bus(
         ConfigError: There is no node with a driver.
     """
     work = _Draughtsman(folder, shipped)
-    files = files_in(source) if source else []
+    files = [path for path in files_in(source) if not work.is_copy(path)] if source else []
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(node.profile == 406 for node in result.nodes)
     if result.silence:
