@@ -153,17 +153,24 @@ class Structure:
             return percent
         return f"{with_unit(self.rms_i[name], self.layout.signal(name).unit)}, {percent}"
 
-    def report(self) -> str:
-        """Return the errors and the result as tables of text."""
+    def report(self, width: int | None = None) -> str:
+        """Return the errors and the result as tables of text.
+
+        Args:
+            width: The table of masks has no errors of single signals if it would have longer lines than this.
+        """
         times = f"{self.splits} splits" if self.splits > 1 else "one split"
         unit = "mean squared error" if self.thresholds.measure == "mse" else "root mean square error"
+        masks = _table(self._mask_rows())
+        if width is not None and max(map(len, masks)) > width:
+            masks = _table(self._mask_rows(is_brief=True))
         lines = [
             f"Errors on held-out data of {times}: L is the {unit} in standard deviations, +- its standard error.",
             "Beside it: the root mean square error in per cent of the standard deviation, and in the signal's unit.",
             "",
             *_table(self._signal_rows()),
             "",
-            *_table(self._mask_rows()),
+            *masks,
         ]
         if len(self.listed) < len(self.L_m):
             lines.append(f"and {len(self.L_m) - len(self.listed)} more")
@@ -183,8 +190,9 @@ class Structure:
             rows.append([name, *self._numbers(value, self.spread_i.get(name, np.nan)), rms, answer, best])
         return rows
 
-    def _mask_rows(self) -> list[list[str]]:
-        outputs = [self.layout.signal(name) for name in self.x_out] if len(self.x_out) <= WIDEST else []
+    def _mask_rows(self, is_brief: bool = False) -> list[list[str]]:
+        is_brief |= len(self.x_out) > WIDEST
+        outputs = [] if is_brief else [self.layout.signal(name) for name in self.x_out]
         heads = [f"{signal.name} [{signal.unit}]" for signal in outputs] if self.rms_m else []
         rows = [["mask", "L_m", "", "% std", *heads, f"feasible if below {self.thresholds.into:g}"]]
         for m in self.listed:

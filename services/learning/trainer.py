@@ -190,7 +190,7 @@ def drafts_of(folder: Path) -> Path:
 def show(trained: TrainingResult, console: Console) -> None:
     """Print the structure, and the error of each signal under each mask in the signal's unit."""
     if trained.structure is not None:
-        console.print(trained.structure.report(), highlight=False, markup=False)
+        console.print(trained.structure.report(console.width), highlight=False, markup=False)
     table = Table(title="Error on held-out data, by the signals of the estimate", title_justify="left")
     table.add_column("estimated from")
     table.add_column("signal")

@@ -31,6 +31,20 @@ def test_finds_the_structure_of_a_muscle_driven_arm(structure):
     assert "x_in  = joint_position, muscle_tension, muscle_length" in report
 
 
+def test_a_narrow_report_has_all_masks_without_the_errors_of_single_signals(structure):
+    wide, narrow = (structure.report(width) for width in (200, 80))
+    heads = [next(line for line in report.splitlines() if line.startswith("mask")) for report in (wide, narrow)]
+    assert wide == structure.report()
+    assert ["muscle_length [m]" in head for head in heads] == [True, False]
+    first = narrow.splitlines().index(heads[1])
+    table = narrow.splitlines()[first : first + 1 + len(structure.listed)]
+    assert [line.split()[0] for line in table[1:]] == [
+        "+".join(n for n in LAYOUT.names if n in m) for m in structure.listed
+    ]
+    assert max(map(len, table)) <= 80
+    assert all(line.endswith(("yes", "no", "poor")) for line in table[1:])
+
+
 @pytest.mark.slow
 def test_measure_and_outputs_are_options(data, structure):
     options = Thresholds(out=1.0, into=1.0, measure="rmse", over="all")
