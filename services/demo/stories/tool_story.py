@@ -187,7 +187,7 @@ class ToolStory:
         away = self._distances(last)
         nearest = self._names[int(np.argmin(away))]
         at = self._settled_at(start, nearest)
-        when = "p did not settle there"
+        when = "p did not settle: it leaves over twice the learned errors, as on a body that is not the designer's"
         if np.isfinite(at):
             first = next(update for moment, update in updates if moment >= at)
             when = f"p settled there after {at - start:.1f} s, with sample {_sample_count(first)}"
