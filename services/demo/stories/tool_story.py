@@ -162,10 +162,12 @@ class ToolStory:
         is_recognised, sentences = self._adapt(self.marks.conditions[1])
         after = self._measure()
         self._client.disengage()
+        verdict = self._verdict(self._timeline.now() - 1.0)[0]
+        reason = " until what is normal is learned anew, because the update changed W" if verdict == "unknown" else ""
         figures = (
             *sentences,
             f"the same targets: tip {1e3 * self._new_error:.0f} mm away before, {1e3 * after:.0f} mm now",
-            f"verdict now: {self._verdict(self._timeline.now() - 1.0)[0]}",
+            f"verdict now: {verdict}{reason}",
         )
         return self._stage(NAMES[3], start, figures, is_recognised and after < BETTER * self._new_error)
 
