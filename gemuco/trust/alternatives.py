@@ -59,8 +59,8 @@ class Alternatives:
         relative to those of the model in use (root mean squares).
         """
         view = self._recent.under(schema, self._relations).view(self._relations, self._hidden)
-        other, now = (float(np.sqrt(np.nanmean(each.z[:, columns] ** 2))) for each in (view, self._now))
-        return self._judge(view), other / now if now > 0.0 else 1.0
+        other, now = (float(np.nansum(each.z[:, columns] ** 2)) for each in (view, self._now))
+        return self._judge(view), float(np.sqrt(other / now)) if now > 0.0 else 1.0
 
     def exchanges(self, evidence: Evidence) -> Iterator[tuple[Hidden, Evidence]]:
         """Yield pairs of elements of one signal with much evidence, and the evidence if they are exchanged back."""

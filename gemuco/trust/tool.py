@@ -45,8 +45,11 @@ class JudgedTool:
 
     @property
     def has_explained(self) -> bool:
-        """Whether this tool or load explained all sensors for a while; one that never did may be a wrong one."""
-        return self.calm - self._met_calm >= EXPLAINS
+        """Whether this tool or load explained all sensors for a while; one that never did may be a wrong one.
+
+        True without p: no tool can be wrong then.
+        """
+        return not len(self.schema.bias) or self.calm - self._met_calm >= EXPLAINS
 
     @property
     def is_another(self) -> bool:

@@ -1,5 +1,7 @@
 """An online update that sees a lie moves p; sensors are judged by the p so far until the new one explains all."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_trust_jumps import ERROR, JOINT, LEARNED, LOAD, SIZE, TIP, after, evidence, motion
@@ -49,6 +51,22 @@ def test_a_tool_that_the_update_has_recognised_is_judged_by(model):
     hidden, bias = judged(model, rows, model.under("long"))
     assert not hidden
     np.testing.assert_array_equal(bias, model.biases["long"])
+
+
+def test_a_tool_explains_the_sensors_after_a_while_and_a_model_without_p_has_none_to_doubt(model):
+    tool = JudgedTool(model)
+    assert not tool.has_explained
+    tool.calm = 6.0
+    assert tool.has_explained
+    tool.propose(model.under("long"))
+    tool.accept(10.0)
+    assert not tool.has_explained, "another tool has explained nothing yet"
+    tool.calm += 6.0
+    tool.propose(moved(model, 1.05))
+    tool.accept(20.0)
+    assert tool.has_explained, "p of the same tool"
+    without = SimpleNamespace(bias=np.zeros(0))
+    assert JudgedTool(without).has_explained
 
 
 def test_what_contradicts_nothing_is_followed_and_the_weights_at_once(model):
