@@ -168,6 +168,15 @@ def test_a_data_sheet_that_an_earlier_draft_copied_is_no_device(tmp_path: Path) 
     assert "stand_in" not in other.text, "a file with another content is the user's"
 
 
+def test_data_sheets_of_this_package_that_the_user_names_are_devices(tmp_path: Path) -> None:
+    (tmp_path / "eds").mkdir()
+    (tmp_path / "eds" / "servo_drive.eds").write_bytes((SHIPPED / "eds" / "servo_drive.eds").read_bytes())
+    for name in ("first", "second"):
+        draft = draft_folder(tmp_path / "eds", name, tmp_path, SHIPPED)
+        assert list(load_robot(written(draft, tmp_path)).devices) == ["servo_drive"]
+        assert "stand_in" not in draft.text and not any("earlier draft" in note for note in draft.notes)
+
+
 def test_a_drive_keeps_off_the_identifiers_of_a_dbc_file(tmp_path: Path) -> None:
     """Node 1 would send 081h, 181h and 581h, which are messages of the file."""
     (tmp_path / "files").mkdir()

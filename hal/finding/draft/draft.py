@@ -76,14 +76,22 @@ class _Draughtsman:
         self.copies[f"{kind}/{name}"] = self.shipped / kind / name
         return f"{kind}/{name}"
 
-    def is_copy(self, path: Path) -> bool:
-        """Whether a file was copied beside the robot file by an earlier draft, so that it describes no own device."""
-        place = self.path_of(path)
-        original = self.shipped / place
-        is_copy = place.count("/") == 1 and original.is_file() and original.read_bytes() == path.read_bytes()
-        if is_copy:
-            self.notes.append(f"Left out: '{place}' was copied there by an earlier draft.")
-        return is_copy
+    def without_copies(self, files: Sequence[Path], source: Path) -> list[Path]:
+        """Return files of a folder without those that an earlier draft copied beside its robot file: no own devices.
+
+        Files that lie in the folder itself, and not deeper, are the user's.
+        """
+        drafts = [file.read_text(errors="replace") for file in self.folder.glob("*.yaml")]
+        own = []
+        for path in files:
+            place = self.path_of(path)
+            original = self.shipped / place
+            is_same = original.is_file() and original.read_bytes() == path.read_bytes()
+            if is_same and path.parent != source and any(place in draft for draft in drafts):
+                self.notes.append(f"Left out: '{place}' was copied there by an earlier draft.")
+            else:
+                own.append(path)
+        return own
 
     def node(self, wish: int | None, first: int) -> int:
         """Return a node id that no other device has: the wished one, or the next from `first` on.
@@ -129,19 +137,19 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
             "MJCF file."
         )
     work = _Draughtsman(folder, shipped)
-    files = [path for path in files if not work.is_copy(path)]
-    known = list(_sheets(files, work.notes))
+    own = work.without_copies(files, source)
+    known = list(_sheets(own, work.notes))
     work.has_encoders = any(sheet.profile == 406 for sheet in known)
     work.waiting += sum(not sheet.node for sheet in known)
     _add_sheets(work, [sheet for sheet in known if sheet.node])
-    for path in files:  # before those without a node id, because the identifiers of a DBC file are not free to choose
+    for path in own:  # before those without a node id, because the identifiers of a DBC file are not free to choose
         if path.suffix.lower() == ".dbc":
             _add_dbc(work, path, None)
     _add_sheets(work, [sheet for sheet in known if not sheet.node])
     if not work.parts:
         raise ConfigError(f"None of {len(files)} files in '{source}' can be used. {' '.join(work.notes)}")
     work.add_stand_in()
-    count = f"{len(files)} file{'s' if len(files) > 1 else ''}"
+    count = f"{len(own)} file{'s' if len(own) > 1 else ''}"
     real = "interface: socketcan, channel: can0. Node ids are guessed: `gemuco scan` lists them."
     return _finished(work, name, f"{count} in {source}", "can0", real, 1_000_000)
 
@@ -164,7 +172,7 @@ def draft_bus(
         ConfigError: There is no node with a driver.
     """
     work = _Draughtsman(folder, shipped)
-    files = [path for path in files_in(source) if not work.is_copy(path)] if source else []
+    files = files_in(source) if source else []
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(node.profile == 406 for node in result.nodes)
     if result.silence:
