@@ -154,18 +154,18 @@ class Case:
         own = float(evidence.strength[list(self._whole(parts) - again.columns)].max())
         return float(evidence.strength[again.lead]) > (1.0 if again.columns < self.cause.columns else SURE) * own
 
-    def finding(self, elements: Sequence[int], since: float, is_known_tool: bool) -> Finding:
+    def finding(self, elements: Sequence[int], since: float, has_explained: bool) -> Finding:
         """Return what others see of it.
 
         Args:
             elements: Positions of its elements in the layout.
             since: They are wrong since this time [s].
-            is_known_tool: Whether the tool or load that the model takes to be in use has explained all sensors before;
-                if not, that one is likelier wrong than a sensor.
+            has_explained: Whether the tool or load that is judged by has explained all sensors before; if not, it is
+                likelier wrong than a sensor.
         """
         return Finding(
             tuple(elements), self.cause.cause, self.kind, since, self.size, self.is_hidden,
-            reason=self.reason, condition=self.cause.condition, is_gross=self.is_gross and is_known_tool,
+            reason=self.reason, condition=self.cause.condition, is_gross=self.is_gross and has_explained,
         )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from services.demo.actor import NOTICED_WITHIN, Actor, Stage
 from services.demo.stories.tool_targets import common_targets
 from services.demo.timeline import Timeline
 from services.errors import ServiceError
+from services.model.anomaly_loop import UNKNOWN
 from services.model.control_config import ControlConfig
 from services.model.model_config import model_config
 from services.wire.messages import Update
@@ -163,11 +164,11 @@ class ToolStory:
         after = self._measure()
         self._client.disengage()
         verdict = self._verdict(self._timeline.now() - 1.0)[0]
-        reason = " until what is normal is learned anew, because the update changed W" if verdict == "unknown" else ""
+        reason = ": what is normal with this W is not learned yet, or p is beyond the trained ones"
         figures = (
             *sentences,
             f"the same targets: tip {1e3 * self._new_error:.0f} mm away before, {1e3 * after:.0f} mm now",
-            f"verdict now: {verdict}{reason}",
+            f"verdict now: {verdict}{reason if verdict == UNKNOWN else ''}",
         )
         return self._stage(NAMES[3], start, figures, is_recognised and after < BETTER * self._new_error)
 
@@ -189,7 +190,10 @@ class ToolStory:
         away = self._distances(last)
         nearest = self._names[int(np.argmin(away))]
         at = self._settled_at(start, nearest)
-        when = "p did not settle: it leaves over twice the learned errors, as on a body that is not the designer's"
+        when = (
+            "p did not settle: it is not well known, or leaves over twice the learned errors, as on a body that is not "
+            "the designer's"
+        )
         if np.isfinite(at):
             first = next(update for moment, update in updates if moment >= at)
             when = f"p settled there after {at - start:.1f} s, with sample {_sample_count(first)}"
