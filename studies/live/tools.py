@@ -5,9 +5,10 @@
 The story of `gemuco demo` for a robot with tools in simulated time, on an actual body, moved by its own controller: the
 service first takes another p to be in use. It updates for 7 s and learns what is normal, its camera is covered for a
 few seconds, and then the tool is changed without a message. The update is on again for 7 s only after that. No sensor
-lies. All loops of the model service run at their own rates. The seed draws the body, its noise and the targets; with
-`--body` these are the same in all plays, and only the rests differ by some 10 ms, as they do from one demo to the next.
-The model is learned once, as by the demo, and kept in runs/NAME/model.
+lies. All loops of the model service run at their own rates; there is no HAL, and the body follows the commands within
+its limit of rate. The seed draws the body, its noise and the targets; with `--body` these are the same in all plays, and
+only the rests differ by some 10 ms, as they do from one demo to the next. The model is learned once, as by the demo,
+and kept in runs/NAME/model.
 """
 
 import argparse
@@ -83,7 +84,10 @@ class Play:
     reason: str = ""
 
     def recognised(self, tool: str) -> bool:
-        """Whether p became that of the changed tool, by the demo's rules."""
+        """Whether p became that of the changed tool, and the tip moved as the demo wants.
+
+        The estimate without the camera, and the verdict, are not judged.
+        """
         if self.reason:
             return False
         first, changed, last = self.errors
@@ -265,7 +269,7 @@ if __name__ == "__main__":
     parser.add_argument("--body", type=int, help="The seed of all plays; the rests differ.")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
-    headings = "plays", "a right one hidden", "stopped for it", "all stages as in the demo", "median errors [mm]"
+    headings = "plays", "a right one hidden", "stopped for it", "tool recognised", "median errors [mm]"
     table = Table("robot", *headings)
     for name in options.robots:
         robot = load_robot(f"robots/{name}.yaml")
