@@ -6,9 +6,9 @@ The story of `gemuco demo` for a robot with tools in simulated time, on an actua
 service first takes another p to be in use. It updates for 7 s and learns what is normal, its camera is covered for a
 few seconds, and then the tool is changed without a message. The update is on again for 7 s only after that. No sensor
 lies. All loops of the model service run at their own rates; there is no HAL, and the body follows the commands within
-its limit of rate. The seed draws the body, its noise and the targets; with `--body` these are the same in all plays, and
-only the rests differ by some 10 ms, as they do from one demo to the next. The model is learned once, as by the demo,
-and kept in runs/NAME/model.
+its limit of rate. The seed draws the body, its noise and the targets; with `--body` these are the same in all plays,
+and only the rests differ by some 10 ms, as they do from one demo to the next. The model is learned once, as by the
+demo, and kept in runs/NAME/model.
 """
 
 import argparse
