@@ -156,10 +156,26 @@ class BusConfig(Section):
     interface: str = "socketcan"
     channel: str
     bitrate: int = 1_000_000
+    data_bitrate: Annotated[int, Field(gt=0)] | None = None
+    """Bit rate of the data of CAN FD frames [bit/s]; without it the bus carries classic frames only."""
     max_load: Annotated[float, Field(gt=0, le=0.8)] = 0.6
     """Largest share of the bit rate for the cyclic frames; the HAL does not start with more."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Arguments for python-can."""
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether the bus carries frames of CAN FD too."""
+        return self.data_bitrate is not None
+
+    @model_validator(mode="after")
+    def _data_is_not_slower(self) -> "BusConfig":
+        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
+            raise ValueError(
+                f"data_bitrate is {self.data_bitrate}, below bitrate, {self.bitrate}: the data of CAN FD frames are "
+                "sent at the same bit rate or a higher one."
+            )
+        return self
 
 
 class KindConfig(Section):

@@ -8,6 +8,7 @@ A packet on the socket has one or more records of one frame each, so a burst of 
 import contextlib
 import select
 import socket
+import struct
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -16,9 +17,10 @@ from typing import Any
 
 import can
 
+from hal.protocols.can_frames import FD_SIZES, LONGEST
 from simulators.hub_server import HubServer
-from simulators.hub_socket import HELLO, PACKET, RECORD, channels, is_trusted, socket_path
-from simulators.wire_time import ERROR, EXTENDED, REMOTE
+from simulators.hub_socket import HELLOS, IS_FD, RECORD, RECORDS, channels, is_trusted, socket_path
+from simulators.wire_time import ERROR, EXTENDED, FD, REMOTE
 
 __all__ = ["HubBus", "HubServer"]
 
@@ -29,8 +31,8 @@ _PATIENCE = 1.0
 class HubBus(can.BusABC):
     """Connection of one program to a bus that a `HubServer` serves.
 
-    Classic frames only. One thread may receive while others send. There is no `fileno`, because frames wait in the
-    object as well as in the socket.
+    Frames of CAN FD pass if the server is one for them. One thread may receive while others send. There is no `fileno`,
+    because frames wait in the object as well as in the socket.
     """
 
     def __init__(
@@ -52,7 +54,8 @@ class HubBus(can.BusABC):
             can.CanInitializationError: No server has the channel.
         """
         path = socket_path(str(channel))
-        self._socket = _join(str(channel), path)
+        self._socket, self._record = _join(str(channel), path)
+        self._largest = RECORDS * self._record.size
         self._socket.setblocking(False)
         self._readable = select.poll()
         self._readable.register(self._socket, select.POLLIN)
@@ -68,22 +71,33 @@ class HubBus(can.BusABC):
         """Send one frame; wait up to `timeout` [s] (1 s if not given) while the bus accepts no frame.
 
         Raises:
-            can.CanOperationError: The server is gone or takes no frames, or the frame is not a classic one.
+            can.CanOperationError: The server is gone or takes no frames, or the channel is not one for such frames.
         """
-        if msg.is_fd or msg.dlc > 8 or len(msg.data) > 8:
-            raise can.CanOperationError("The hub carries classic CAN frames of at most 8 bytes.")
+        if msg.is_fd and (self._record is RECORD or len(msg.data) not in FD_SIZES):
+            raise can.CanOperationError(
+                f"A frame of CAN FD with {len(msg.data)} bytes does not pass {self.channel_info}. Is it one of "
+                f"{', '.join(map(str, FD_SIZES))}, and has the bus a data_bitrate?"
+            )
+        if not msg.is_fd and (msg.dlc > LONGEST or len(msg.data) > LONGEST):
+            raise can.CanOperationError(f"A classic CAN frame has at most {LONGEST} bytes.")
         if not 0 <= msg.arbitration_id <= (0x1FFFFFFF if msg.is_extended_id else 0x7FF):
             raise can.CanOperationError(f"Identifier 0x{msg.arbitration_id:X} is out of range.")
-        self._put(RECORD.pack(message_identifier(msg), msg.dlc, time.time(), bytes(msg.data)), timeout)
+        length = len(msg.data) | IS_FD if msg.is_fd else msg.dlc
+        self._put(self._record.pack(message_identifier(msg), length, time.time(), bytes(msg.data)), timeout)
         if self._own:
             self._waiting.append(msg)
 
     def send_frames(self, frames: Iterable[tuple[int, bytes]], timeout: float | None = None) -> None:
         """Send several data frames (identifier with flags, data) in few packets; otherwise as `send`."""
-        now = time.time()
-        records = b"".join([RECORD.pack(identifier, len(data), now, data) for identifier, data in frames])
-        for start in range(0, len(records), PACKET):
-            self._put(records[start : start + PACKET], timeout)
+        now, pack = time.time(), self._record.pack
+        records = b"".join(
+            [
+                pack(identifier & ~FD, len(data) | (IS_FD if identifier & FD else 0), now, data)
+                for identifier, data in frames
+            ]
+        )
+        for start in range(0, len(records), self._largest):
+            self._put(records[start : start + self._largest], timeout)
 
     def _put(self, packet: bytes, timeout: float | None) -> None:
         deadline = None
@@ -110,11 +124,12 @@ class HubBus(can.BusABC):
         frames = [(message_identifier(message), bytes(message.data)) for message in self._waiting]
         self._waiting.clear()
         packet = self._packet(0.0 if frames else timeout)
-        return frames + [(identifier, data[:length]) for identifier, length, _, data in RECORD.iter_unpack(packet)]
+        records = self._record.iter_unpack(packet)
+        return frames + [(identifier, data[: length & ~IS_FD]) for identifier, length, _, data in records]
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._waiting:
-            for identifier, length, stamp, data in RECORD.iter_unpack(self._packet(timeout)):
+            for identifier, length, stamp, data in self._record.iter_unpack(self._packet(timeout)):
                 self._waiting.append(_message(identifier, length, stamp, data, self._channel))
         return (self._waiting.popleft() if self._waiting else None), False
 
@@ -123,7 +138,7 @@ class HubBus(can.BusABC):
         if not self._readable.poll(None if timeout is None else timeout * 1e3):
             return b""
         try:
-            packet = self._socket.recv(PACKET)
+            packet = self._socket.recv(self._largest)
         except BlockingIOError:
             return b""
         except OSError:
@@ -151,16 +166,16 @@ class HubBus(can.BusABC):
         return [{"interface": "hub", "channel": channel} for channel in channels()]
 
 
-def _join(channel: str, path: Path) -> socket.socket:
-    """Return a socket that the server has admitted."""
+def _join(channel: str, path: Path) -> tuple[socket.socket, struct.Struct]:
+    """Return a socket that the server has admitted, and the records of the channel."""
     link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     link.settimeout(_PATIENCE)
     try:
         link.connect(str(path))
         if not is_trusted(link):
             reason = "a program of another user answers"
-        elif link.recv(PACKET) == HELLO:
-            return link
+        elif (record := HELLOS.get(link.recv(64))) is not None:
+            return link, record
         else:
             reason = "another program answers"
     except OSError as error:
@@ -180,6 +195,7 @@ def message_identifier(message: can.Message) -> int:
 
 
 def _message(identifier: int, length: int, stamp: float, data: bytes, channel: str) -> can.Message:
+    is_fd, length = bool(length & IS_FD), length & ~IS_FD
     return can.Message(
         timestamp=stamp,
         arbitration_id=identifier & 0x1FFFFFFF,
@@ -187,6 +203,8 @@ def _message(identifier: int, length: int, stamp: float, data: bytes, channel: s
         is_remote_frame=bool(identifier & REMOTE),
         is_error_frame=bool(identifier & ERROR),
         channel=channel,
+        is_fd=is_fd,
+        bitrate_switch=is_fd,
         dlc=length,
         data=None if identifier & REMOTE else data[:length],
     )

@@ -14,13 +14,13 @@ from typing import Self
 
 import can
 
-from simulators.hub_socket import HELLO, PACKET, RECORD, mode_of, socket_path
+from simulators.hub_socket import HELLOS, IS_FD, RECORD, RECORD_FD, RECORDS, mode_of, socket_path
 from simulators.wire_time import ERROR, Wire
 
 _log = logging.getLogger(__name__)
 
-_BACKLOG = 100_000 * RECORD.size
-"""A client with more waiting bytes than this is disconnected: ten seconds of a full 1 Mbit/s bus."""
+_BACKLOG = 100_000
+"""A client with more waiting frames than this is disconnected: ten seconds of a full 1 Mbit/s bus."""
 _QUEUE = 256
 """A timed bus accepts no frames of a program while this number of its frames waits. Each program has its own queue, as
 each controller has: one that talks all the time does not keep urgent frames of others from the arbitration."""
@@ -42,17 +42,20 @@ class HubServer:
     lowest identifier first. They are sent, and stamped, at the time of their last bit on a real bus.
     """
 
-    def __init__(self, channel: str, bitrate: int | None = None) -> None:
+    def __init__(self, channel: str, bitrate: int | None = None, data_bitrate: int | None = None) -> None:
         """Prepare a server.
 
         Args:
             channel: Name of the channel, or the absolute path of its socket.
             bitrate: Simulated bit rate [bit/s]; None for no delay.
+            data_bitrate: Bit rate of the data of CAN FD frames [bit/s]; None for a channel of classic frames only.
         """
         self.channel = channel
         self._path = socket_path(channel)
-        self._bitrate = bitrate
-        self._wire = Wire(bitrate) if bitrate else None
+        self._record = RECORD_FD if data_bitrate else RECORD
+        self._hello = next(hello for hello, record in HELLOS.items() if record is self._record)
+        self._largest = RECORDS * self._record.size
+        self._wire = Wire(bitrate, data_bitrate) if bitrate else None
         self._clients: list[_Client] = []
         self._thread: threading.Thread | None = None
         self._counters = {"frames": 0, "joined": 0, "cut_off": 0, "malformed": 0}
@@ -131,7 +134,7 @@ class HubServer:
         with contextlib.suppress(OSError):  # the program may have ended already
             peer, _ = self._listener.accept()
             peer.setblocking(False)
-            peer.send(HELLO, socket.MSG_NOSIGNAL)
+            peer.send(self._hello, socket.MSG_NOSIGNAL)
             self._clients.append(_Client(peer))
             self._counters["joined"] += 1
 
@@ -140,7 +143,7 @@ class HubServer:
             if self._is_full(client):
                 return
             try:
-                packet = client.socket.recv(PACKET)
+                packet = client.socket.recv(self._largest)
             except BlockingIOError:
                 return
             except OSError:
@@ -148,31 +151,32 @@ class HubServer:
             if not packet:
                 self._drop(client)
                 return
-            if len(packet) % RECORD.size:
+            if len(packet) % self._record.size:
                 self._counters["malformed"] += 1
                 _log.warning("hub %s: disconnected a client that sent a packet of a wrong size", self.channel)
                 self._drop(client)
                 return
-            self._counters["frames"] += len(packet) // RECORD.size
+            self._counters["frames"] += len(packet) // self._record.size
             if self._wire is None:
                 self._share(client, packet)
             else:
                 self._queue(self._wire, client, packet)
 
     def _queue(self, wire: Wire, client: _Client, packet: bytes) -> None:
-        now = time.monotonic()
-        for start in range(0, len(packet), RECORD.size):
-            record = packet[start : start + RECORD.size]
-            identifier, length, _, data = RECORD.unpack(record)
+        now, size = time.monotonic(), self._record.size
+        for start in range(0, len(packet), size):
+            record = packet[start : start + size]
+            identifier, length, _, data = self._record.unpack(record)
             if identifier & ERROR:
                 self._share(client, record)
+            elif length & IS_FD:
+                wire.push_fd(now, client, identifier, data[: length & ~IS_FD], record)
             else:
                 wire.push(now, client, identifier, data[:length], min(length, 8), record)
 
-    @staticmethod
-    def _restamp(record: bytes, end: float) -> bytes:
-        identifier, length, _, data = RECORD.unpack(record)
-        return RECORD.pack(identifier, length, time.time() - time.monotonic() + end, data)
+    def _restamp(self, record: bytes, end: float) -> bytes:
+        identifier, length, _, data = self._record.unpack(record)
+        return self._record.pack(identifier, length, time.time() - time.monotonic() + end, data)
 
     def _share(self, sender: object, records: bytes) -> None:
         for client in self._clients:
@@ -182,14 +186,14 @@ class HubServer:
     def _flush(self, client: _Client) -> None:
         while client.outbox:
             try:
-                sent = client.socket.send(client.outbox[:PACKET], socket.MSG_NOSIGNAL)
+                sent = client.socket.send(client.outbox[: self._largest], socket.MSG_NOSIGNAL)
             except BlockingIOError:
                 break
             except OSError:
                 self._drop(client)
                 return
             del client.outbox[:sent]
-        if len(client.outbox) > _BACKLOG:
+        if len(client.outbox) > _BACKLOG * self._record.size:
             self._counters["cut_off"] += 1
             _log.warning("hub %s: disconnected a client that does not read", self.channel)
             self._drop(client)

@@ -12,12 +12,15 @@ from hal.own_folder import NotOwnFolder, own_folder
 
 BUSES = "GEMUCO_BUSES"
 """This variable names a folder for the sockets of hub channels that programs of several users share."""
-RECORD = struct.Struct("<IB3xd8s")
-"""A record holds identifier with flags, length, time stamp [s since 1970] and data."""
-PACKET = 128 * RECORD.size
-"""A packet has at most this many bytes."""
-HELLO = b"gemuco hub 1"
-"""This is the first packet from the server. The program receives every frame after it."""
+RECORD, RECORD_FD = struct.Struct("<IB3xd8s"), struct.Struct("<IB3xd64s")
+"""A record holds identifier with flags, length with the flag `IS_FD`, time stamp [s since 1970] and data. On a channel
+for CAN FD every frame has the larger record."""
+IS_FD = 0x80
+RECORDS = 128
+"""A packet has at most this number of records."""
+HELLOS = {b"gemuco hub 1": RECORD, b"gemuco hub 1 fd": RECORD_FD}
+"""One of these is the first packet from the server, and says which records pass. The program receives every frame after
+it."""
 
 
 def socket_path(channel: str) -> Path:

@@ -12,6 +12,7 @@ import numpy as np
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone, ConfigError
 from hal.line.port import SERIAL
+from hal.wire.interface import open_interface
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
 from simulators.lies import LIES, SWAPPED, TRUE, known_lies, lie_of
@@ -69,7 +70,8 @@ class Rig:
         self._segments: dict[str, Segment | LineSegment] = {}
         for name, bus in config.buses.items():
             if bus.interface == "hub":
-                self._servers[name] = HubServer(bus.channel, bus.bitrate if bus.options.get("bit_timing") else None)
+                timed = bus.bitrate if bus.options.get("bit_timing") else None
+                self._servers[name] = HubServer(bus.channel, timed, bus.data_bitrate)
             specs = [spec for spec in hardware if spec.bus == name]
             if bus.interface == "serial":
                 raise ConfigError(
@@ -270,7 +272,7 @@ class Rig:
 
 def _opener(bus: BusConfig) -> Callable[[], can.BusABC]:
     def open_bus() -> can.BusABC:
-        return can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate, **bus.options)
+        return open_interface(bus)
 
     return open_bus
 

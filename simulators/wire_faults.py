@@ -7,14 +7,16 @@ only on request, so on interface `virtual` a test does not wait in real time and
 import random
 from collections import deque
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 
 import can
 
+from hal.protocols.can_frames import LONGEST, LONGEST_FD, fd_size
+
 BUS_OFF, RESTARTED, NO_ACKNOWLEDGE, CONTROLLER = 0x40, 0x100, 0x20, 0x04
 """These are classes of error frames, and below them details of `CONTROLLER` (linux/can/error.h)."""
 WARNING, PASSIVE = 0x0C, 0x30
-_LARGEST = 8
 _NODE = 0x7F
 _SHARED = (0x000, 0x080)
 """The identifiers of NMT and SYNC carry no node id."""
@@ -28,7 +30,7 @@ class Chances:
         loss: The frame does not arrive.
         duplicate: The frame arrives twice.
         short: Its last bytes are missing.
-        long: Bytes are added; the frame has at most eight bytes.
+        long: Bytes are added, as far as the frame can have more.
         corrupt: One of its bytes is changed. Only frames of nodes, because a checksum protects frames on the wire.
         delay: The frame arrives `delayed_by` later, after frames that were sent after it.
         delayed_by: Delay [s].
@@ -156,8 +158,9 @@ class FaultyWire:
         data, chances = bytes(message.data), self.chances
         if draw.random() < chances.short:
             data = data[: draw.randrange(max(len(data), 1))]
-        if draw.random() < chances.long and len(data) < _LARGEST:
-            data += draw.randbytes(draw.randint(1, _LARGEST - len(data)))
+        largest = LONGEST_FD if message.is_fd else LONGEST
+        if draw.random() < chances.long and len(data) < largest:
+            data += draw.randbytes(draw.randint(1, largest - len(data)))
         if is_from_node and draw.random() < chances.corrupt and data:
             place = draw.randrange(len(data))
             data = data[:place] + bytes([data[place] ^ draw.randint(1, 255)]) + data[place + 1 :]
@@ -178,12 +181,19 @@ class FaultyWire:
 
 
 def _with_node(message: can.Message, node: int) -> can.Message:
-    identifier = message.arbitration_id & ~_NODE | node
-    return can.Message(arbitration_id=identifier, data=message.data, is_extended_id=message.is_extended_id)
+    readdressed = copy(message)
+    readdressed.arbitration_id = message.arbitration_id & ~_NODE | node
+    return readdressed
 
 
 def _with_data(message: can.Message, data: bytes) -> can.Message:
-    return can.Message(arbitration_id=message.arbitration_id, data=data, is_extended_id=message.is_extended_id)
+    return can.Message(
+        arbitration_id=message.arbitration_id,
+        data=data.ljust(fd_size(len(data)), b"\0") if message.is_fd else data,
+        is_extended_id=message.is_extended_id,
+        is_fd=message.is_fd,
+        bitrate_switch=message.bitrate_switch,
+    )
 
 
 def _put(bus: can.BusABC, message: can.Message) -> None:

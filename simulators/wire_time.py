@@ -1,12 +1,16 @@
-"""Duration of frames on a real CAN bus, and their arbitration (ISO 11898-1, classic frames)."""
+"""Duration of frames on a real CAN bus, classic and of CAN FD, and their arbitration (ISO 11898-1:2015)."""
 
 import heapq
 from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 
+from hal.protocols.can_frames import FD_SIZES, checksum_bits
+
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 """These flags are in the bits above the identifier, as in SocketCAN."""
+FD = 1 << 32
+"""This flag marks a frame of CAN FD that a node sends; on a socket the length has it."""
 
 _TAIL_BITS = 13
 """CRC delimiter, acknowledge slot and delimiter, end of frame and the 3 bits between frames have this length [bits];
@@ -80,6 +84,25 @@ def frame_bits(identifier: int, data: bytes, length: int | None = None) -> int:
     return stream_bits + stuffed + _TAIL_BITS
 
 
+def fd_frame_bits(identifier: int, data: bytes) -> tuple[int, int]:
+    """Return the parts of a frame of CAN FD at the bit rates of bus and data [bit], with stuff bits and the gap.
+
+    The bit rate is switched. Checksum and stuff count have a fixed number of stuff bits, so their values do not matter.
+    """
+    code = FD_SIZES.index(len(data))
+    if identifier & EXTENDED:
+        base, rest = identifier >> 18 & 0x7FF, identifier & 0x3FFFF
+        head, head_bits = (base << 2 | 3) << 22 | rest << 4 | 0b0101, 36  # RRS, FDF, res, BRS
+    else:
+        head, head_bits = (identifier & 0x7FF) << 5 | 0b00101, 17  # RRS, IDE, FDF, res, BRS
+    state, in_head = _stuff(_IDLE, head, head_bits)
+    state, stuffed = _stuff(state, code, 5)  # ESI and length
+    for byte in data:
+        state, more = _STUFF[state][byte]
+        stuffed += more
+    return head_bits + in_head + _TAIL_BITS, 5 + 8 * len(data) + stuffed + checksum_bits(len(data))
+
+
 def arbitration(identifier: int) -> int:
     """Return the number that is compared on the wire; the lower one wins."""
     remote = 1 if identifier & REMOTE else 0
@@ -102,8 +125,8 @@ class Wire:
     A frame that is being sent is not interrupted. Times [s] are those of one monotonic clock.
     """
 
-    def __init__(self, bitrate: int) -> None:
-        self._bit = 1.0 / bitrate
+    def __init__(self, bitrate: int, data_bitrate: int | None = None) -> None:
+        self._bit, self._data_bit = 1.0 / bitrate, 1.0 / (data_bitrate or bitrate)
         self._waiting: list[tuple[int, int, _Waiting]] = []
         self._count = 0
         self._count_of: Counter[Hashable] = Counter()
@@ -120,10 +143,17 @@ class Wire:
         return self._count_of[sender]
 
     def push(self, now: float, sender: Hashable, identifier: int, data: bytes, length: int, frame: bytes) -> None:
-        """Add a frame to the waiting frames."""
-        entry = _Waiting(sender, frame, now, frame_bits(identifier, data, length) * self._bit)
+        """Add a classic frame to the waiting frames."""
+        self._add(identifier, _Waiting(sender, frame, now, frame_bits(identifier, data, length) * self._bit))
+
+    def push_fd(self, now: float, sender: Hashable, identifier: int, data: bytes, frame: bytes) -> None:
+        """Add a frame of CAN FD to the waiting frames."""
+        at_bus, at_data = fd_frame_bits(identifier, data)
+        self._add(identifier, _Waiting(sender, frame, now, at_bus * self._bit + at_data * self._data_bit))
+
+    def _add(self, identifier: int, entry: _Waiting) -> None:
         self._count += 1
-        self._count_of[sender] += 1
+        self._count_of[entry.sender] += 1
         heapq.heappush(self._waiting, (arbitration(identifier), self._count, entry))
 
     def advance(self, now: float) -> list[tuple[object, bytes, float]]:

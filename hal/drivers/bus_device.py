@@ -15,6 +15,7 @@ from hal.calibration.line import Calibration
 from hal.config import Positive, Section
 from hal.device import UNDER_POWER, Device, DeviceHealth, DeviceState, Reading
 from hal.errors import DeviceSilent, HalError, WrongDevice
+from hal.protocols.can_frames import Frames
 from hal.wire.bus import Bus
 from hal.wire.contract import Wire
 
@@ -92,18 +93,18 @@ class BusDevice(Device, Generic[WireT]):
         return None
 
     @classmethod
-    def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
+    def traffic(cls, settings: Any, rate: float) -> tuple[Frames | tuple[int, float], ...]:
         """Return data bytes and frames per second [Hz] of its whole traffic, at `rate` cycles per second.
 
-        A third value is True if the identifier has 29 bits. A driver defines this method, or `traffic_of`.
+        A driver defines this method, or `traffic_of`.
         """
         raise NotImplementedError
 
     @classmethod
     def traffic_of(
-        cls, settings: Any, rate: float, quantities: tuple[str, ...]
-    ) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
-        """Return the `traffic` of a device of which the robot file uses these quantities."""
+        cls, settings: Any, rate: float, quantities: tuple[str, ...], folder: Path
+    ) -> tuple[Frames | tuple[int, float], ...]:
+        """Return the `traffic` of a device of which the robot file, in this folder, uses these quantities."""
         return cls.traffic(settings, rate)
 
     def __init__(self, place: Place[WireT], settings: DeviceSettings) -> None:

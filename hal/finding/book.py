@@ -29,10 +29,11 @@ class Frame:
     Attributes:
         stamp: Time stamp of the interface [s since 1970].
         identifier: 11 bits, or 29 if extended; the error class of an error frame.
-        data: Up to 8 bytes.
+        data: Up to 8 bytes, of CAN FD up to 64.
         is_extended: Whether the identifier has 29 bits.
         is_remote: Whether the frame requests data.
         is_error: Whether the frame is an error report of the controller.
+        is_fd: Whether the frame is one of CAN FD.
     """
 
     stamp: float
@@ -41,6 +42,7 @@ class Frame:
     is_extended: bool = False
     is_remote: bool = False
     is_error: bool = False
+    is_fd: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ class Book:
 
     def learn(self, frame: Frame) -> None:
         """Update a mapping that an SDO client writes or reads; ignore all other frames."""
-        if frame.is_extended or frame.is_remote or frame.is_error or len(frame.data) != 8:
+        if frame.is_extended or frame.is_fd or frame.is_remote or frame.is_error or len(frame.data) != 8:
             return
         function, node = frame.identifier & 0x780, frame.identifier & 0x7F
         if function not in (cia301.SDO_REQUEST, cia301.SDO_ANSWER) or not node:

@@ -52,8 +52,8 @@ def describe(frame: Frame, book: Book) -> FrameText:
     if key in book.explainers:
         kind, explain = book.explainers[key]
         return FrameText(kind, *explain(frame.data))
-    if frame.is_extended:
-        return FrameText("?", None, "")
+    if frame.is_extended or frame.is_fd:
+        return FrameText("CAN FD" if frame.is_fd else "?", None, "")
     if frame.identifier in book.pdos:
         return _pdo(book.pdos[frame.identifier], frame.data, book)
     return _predefined(frame, book)

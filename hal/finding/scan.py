@@ -20,9 +20,9 @@ from hal.finding.dbc_nodes import DbcDevice, Identifier, dbc_devices
 from hal.finding.decode import nmt_words
 from hal.finding.tap import Tap
 from hal.protocols import cia301, sdo
+from hal.protocols.can_frames import CLASSIC, FrameLengths, frame_bits
 from hal.protocols.mit import Special, special
 from hal.protocols.sdo import Upload
-from hal.wire.budget import frame_bits
 from hal.wire.bus import OWN_NODE
 
 _MIT_SPECIALS = {
@@ -108,7 +108,8 @@ class Node:
 class Traffic:
     """Frames that were received so far, and the nodes that sent them."""
 
-    def __init__(self, devices: Sequence[DbcDevice] = ()) -> None:
+    def __init__(self, devices: Sequence[DbcDevice] = (), lengths: FrameLengths = CLASSIC) -> None:
+        self._lengths = lengths
         self._devices = {identifier: device for device in devices for identifier in device.known}
         self._senders = {identifier: device for device in devices for identifier in device.sends}
         self.nodes: dict[tuple[str, int], Node] = {}
@@ -116,7 +117,7 @@ class Traffic:
         """Name in the robot file -> a node with a DBC file."""
         self.counts: Counter[int] = Counter()
         """Identifier -> frames; 29-bit identifiers have `EXTENDED` set."""
-        self.bits = 0
+        self.bits = 0.0
         self._last: dict[int, bytes] = {}
         self._masters: set[str] = set()
         self.retried: set[int] = set()
@@ -128,8 +129,8 @@ class Traffic:
             return
         identifier, data = frame.identifier, frame.data
         self.counts[identifier | (EXTENDED if frame.is_extended else 0)] += 1
-        self.bits += frame_bits(len(data), frame.is_extended)
-        if self._note_dbc((identifier, frame.is_extended)) or frame.is_extended:
+        self.bits += self._lengths.of(len(data), frame.is_extended, frame.is_fd)
+        if self._note_dbc((identifier, frame.is_extended)) or frame.is_extended or frame.is_fd:
             return
         self._last[identifier] = data
         function, node = identifier & 0x780, identifier & 0x7F
@@ -374,7 +375,7 @@ def scan(
     Raises:
         BusGone: The interface failed, or takes no frames.
     """
-    traffic = Traffic(devices)
+    traffic = Traffic(devices, FrameLengths(tap.config.bitrate, tap.config.data_bitrate))
     deadline = time.monotonic() + listen
     while (remaining := deadline - time.monotonic()) > 0:
         traffic.note(tap.receive(min(remaining, 0.1)))

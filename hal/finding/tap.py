@@ -16,6 +16,7 @@ import can
 from hal.config import BusConfig
 from hal.errors import BusGone, ConfigError
 from hal.finding.book import Frame
+from hal.wire.interface import open_interface
 
 POLL = 0.1
 """A reader checks with this period [s] whether it must end."""
@@ -40,9 +41,7 @@ class Tap:
     def __enter__(self) -> Self:
         config = self.config
         try:
-            self._can = can.Bus(
-                config.channel, config.interface, ignore_config=True, bitrate=config.bitrate, **config.options
-            )
+            self._can = open_interface(config)
         except Exception as error:  # an interface plugin may raise anything
             where, why = f"'{self.name}' ({config.interface} {config.channel})", str(error).rstrip(".")
             advice = "" if why.endswith("?") else ". Is it there, is it up?"
@@ -76,6 +75,7 @@ class Tap:
             message.is_extended_id,
             message.is_remote_frame,
             message.is_error_frame,
+            message.is_fd,
         )
 
     def send(self, identifier: int, data: bytes) -> None:

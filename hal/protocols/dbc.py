@@ -18,6 +18,7 @@ from cantools.database import Database, Message
 from cantools.database.can.signal import Signal
 
 from hal.errors import ConfigError
+from hal.protocols.can_frames import LONGEST, LONGEST_FD, fd_size
 from hal.protocols.dbc_text import decoded, mended
 
 Value = float | str
@@ -33,18 +34,14 @@ _LARGEST_FLOATS = {16: 65504.0, 32: 3.4e38}
 """Values that fit into a float of this number of bits; a larger one could not be packed."""
 
 
-LONGEST = 8
-"""A frame of classic CAN has at most this number of data bytes."""
-
-
 class Dbc:
     """A DBC file. An unknown name is a `ConfigError` that lists the known ones.
 
     Attributes:
         path: The file.
         messages: Its messages.
-        left_out: Name of a message that cannot be used -> why: it is longer than a frame, or its signals overlap or do
-            not fit.
+        left_out: Name of a message that cannot be used -> why: it is longer than a frame of CAN FD, or its signals
+            overlap or do not fit.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -116,8 +113,8 @@ class Dbc:
 def load(path: Path) -> Dbc:
     """Read a DBC file, once per file.
 
-    Files of vendors have messages that contradict themselves, or of CAN FD. Only these are left out. Slips that
-    change no value are mended (`hal.protocols.dbc_text`).
+    Files of vendors have messages that contradict themselves. Only these are left out. Slips that change no value are
+    mended (`hal.protocols.dbc_text`).
 
     Raises:
         ConfigError: It is missing or not a DBC file.
@@ -135,13 +132,23 @@ def load(path: Path) -> Dbc:
 
 def _fault_of(message: Message) -> str:
     """Return why a message cannot be used; empty if it can."""
-    if message.length > LONGEST:
-        return f"It has {message.length} bytes; a frame has at most {LONGEST}, and CAN FD is not supported."
+    if message.length > LONGEST_FD:
+        return f"It has {message.length} bytes; a frame of CAN FD has at most {LONGEST_FD}."
     try:
         message.refresh(strict=True)
     except cantools.Error as error:
         return str(error)
     return ""
+
+
+def is_fd(message: Message) -> bool:
+    """Whether the frames of a message are of CAN FD: by its attribute VFrameFormat, or by its length."""
+    return bool(message.is_fd) or message.length > LONGEST
+
+
+def size_of(message: Message) -> int:
+    """Return the data bytes of the frames of a message; one of CAN FD may have more than its signals need."""
+    return fd_size(message.length) if is_fd(message) else message.length
 
 
 def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:
@@ -174,7 +181,7 @@ class SignalReader:
     Attributes:
         message: The message.
         names: The signals, in the order in which `read` returns them.
-        size: Data bytes of the message.
+        size: Data bytes of its frames.
         is_compiled: Whether it is read without cantools.
         read: Data of `size` bytes -> raw values; NaN for a signal on another page of a multiplexed message; None if
             cantools cannot decode the data by the file.
@@ -185,7 +192,7 @@ class SignalReader:
         signals = sorted((s for s in message.signals if s.name in selection), key=_first_byte)
         self.message = message
         self.names = tuple(signal.name for signal in signals)
-        self.size = message.length
+        self.size = size_of(message)
         layout = _layout(message, signals)
         fast = layout.unpack if layout is not None else _shifts(message, signals)
         self.is_compiled = fast is not None
@@ -251,9 +258,11 @@ class Writer:
         self.data[:] = self._encode()
 
     def _encode(self) -> bytearray:
-        if not self._message.signals:
-            return bytearray(self._message.length)
-        return bytearray(self._message.encode(self._raws, scaling=False, strict=False))
+        data = bytearray(size_of(self._message))
+        if self._message.signals:
+            encoded = self._message.encode(self._raws, scaling=False, strict=False)
+            data[: len(encoded)] = encoded
+        return data
 
 
 def _layout(message: Message, signals: Sequence[Signal]) -> struct.Struct | None:
@@ -268,7 +277,8 @@ def _layout(message: Message, signals: Sequence[Signal]) -> struct.Struct | None
             return None
         layout += f"{start - end}x{code}"
         end = start + signal.length // 8
-    return struct.Struct(f"{layout}{message.length - end}x") if end <= message.length else None
+    size = size_of(message)
+    return struct.Struct(f"{layout}{size - end}x") if end <= size else None
 
 
 def _shifts(message: Message, signals: Sequence[Signal]) -> Read | None:
@@ -279,7 +289,7 @@ def _shifts(message: Message, signals: Sequence[Signal]) -> Read | None:
     if len(orders) != 1 or any(signal.is_float or signal.multiplexer_ids is not None for signal in signals):
         return None
     is_little = orders == {"little_endian"}
-    words, unpack = _words(message.length, "<" if is_little else ">", [_span(signal) for signal in signals])
+    words, unpack = _words(size_of(message), "<" if is_little else ">", [_span(signal) for signal in signals])
     parts = []
     for signal in signals:
         first, end = _span(signal)

@@ -1,8 +1,6 @@
 """Load of a bus, computed from the robot file before a frame is sent.
 
-Source: classic CAN (ISO 11898-1). A frame has 44 bits beside the data with an 11-bit identifier, 64 with a 29-bit
-identifier. In 34 or 54 of these bits and in the data, every fourth bit after the first may be followed by a stuff bit.
-The space between frames has 3 bits. On a serial line packets are counted as frames.
+On a serial line packets are counted as frames.
 """
 
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.line.port import SERIAL
+from hal.protocols.can_frames import FrameLengths, Frames, frame_bits
 
 OWN_HEARTBEAT_RATE = 50.0
 """The HAL sends its heartbeat at this rate [Hz]. A drive stops after 0.15 s without one, and a machine under load may
@@ -20,12 +19,6 @@ BITS_PER_BYTE = 10
 """A byte on a serial line has 8 bits, a start bit and a stop bit."""
 
 
-def frame_bits(size: int, is_extended: bool = False) -> int:
-    """Return the longest length of a classic frame with `size` data bytes [bit], with stuff bits and space."""
-    stuffed = (54 if is_extended else 34) + 8 * size
-    return 13 + stuffed + (stuffed - 1) // 4
-
-
 @dataclass(frozen=True, slots=True)
 class BusBudget:
     """Load of one bus by cyclic frames.
@@ -33,7 +26,7 @@ class BusBudget:
     Attributes:
         bus: Name in the robot file.
         frames: Number of frames per cycle, including a SYNC.
-        bits: Sum of the longest lengths of these frames [bit].
+        bits: Sum of the longest lengths of these frames [bit at the bit rate of the bus].
         beside: Load by heartbeats and other frames with a rate of their own [bit/s].
         rate: Cycles per second [Hz].
         bitrate: Bit rate of the bus [bit/s].
@@ -41,7 +34,7 @@ class BusBudget:
 
     bus: str
     frames: int
-    bits: int
+    bits: float
     beside: float
     rate: float
     bitrate: int
@@ -53,7 +46,7 @@ class BusBudget:
 
     def __str__(self) -> str:
         return (
-            f"{self.frames} frames of together {self.bits} bits at {self.rate:g} Hz and {self.beside / 1e3:.1f} "
+            f"{self.frames} frames of together {self.bits:.0f} bits at {self.rate:g} Hz and {self.beside / 1e3:.1f} "
             f"kbit/s beside the cycle are {self.load:.0%} of {self.bitrate / 1e6:g} Mbit/s"
         )
 
@@ -65,10 +58,12 @@ def budgets(config: RobotConfig) -> list[BusBudget]:
 
 def _budget(config: RobotConfig, bus: str) -> BusBudget:
     rate = config.rates.hal
-    cyclic: list[int] = []
+    section = config.buses[bus]
+    lengths = FrameLengths(section.bitrate, section.data_bitrate)
+    cyclic: list[float] = []
     beside = 0.0
     has_sync = False
-    is_serial = config.buses[bus].interface in SERIAL
+    is_serial = section.interface in SERIAL
     states: list[int] = []
     for device, entry in config.devices.items():
         if entry.bus != bus:
@@ -78,8 +73,11 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
         if is_serial and driver.state is not None:
             states.append(BITS_PER_BYTE * (2 * driver.packets.OVERHEAD + driver.state[1]))
         quantities = tuple(entry.elements) or driver.quantities(settings)[:1]
-        for size, times, *extended in driver.traffic_of(settings, rate, quantities):
-            bits = BITS_PER_BYTE * size if is_serial else frame_bits(size, any(extended))
+        for frames in driver.traffic_of(settings, rate, quantities, config.folder):
+            size, times, is_extended, is_fd = Frames(*frames)
+            bits: float = BITS_PER_BYTE * size
+            if not is_serial:  # a device of a serial line on a CAN bus is refused later
+                bits = lengths.of(size, is_extended, is_fd) if is_fd else frame_bits(size, is_extended)
             if times == rate:
                 cyclic.append(bits)
             else:
@@ -87,9 +85,9 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
     if states:  # that of one servo per cycle
         cyclic.append(max(states))
     if has_sync:
-        cyclic.append(frame_bits(0))
-        beside += OWN_HEARTBEAT_RATE * frame_bits(1)
-    return BusBudget(bus, len(cyclic), sum(cyclic), beside, rate, config.buses[bus].bitrate)
+        cyclic.append(lengths.classic[0])
+        beside += OWN_HEARTBEAT_RATE * lengths.classic[1]
+    return BusBudget(bus, len(cyclic), sum(cyclic), beside, rate, section.bitrate)
 
 
 def check(config: RobotConfig) -> None:

@@ -18,7 +18,9 @@ from hal.config import BusConfig
 from hal.errors import ConfigError
 from hal.log_limit import LogLimit
 from hal.protocols import cia301
+from hal.protocols.can_frames import FrameLengths
 from hal.wire.budget import OWN_HEARTBEAT_RATE
+from hal.wire.interface import open_interface
 from hal.wire.kernel import Kernel, set_buffers
 from hal.wire.receive import OWN_NODE, Receiver
 from hal.wire.routes import Handler
@@ -89,11 +91,12 @@ class Bus:
         self._log = LogLimit(log)
         self._watch = BusWatch(self._changed)
         self._losses = 0
-        self._sender = Sender(self.counters, lambda text: self._watch.worry(text, clock.monotonic()))
+        lengths = FrameLengths(config.bitrate, config.data_bitrate)
+        self._sender = Sender(self.counters, lambda text: self._watch.worry(text, clock.monotonic()), lengths)
         self.network = canopen.Network(_Network(self._sender))  # type: ignore[arg-type]
         self._arrival = ArrivalClock()
         self._frame_clock = FrameClock(clock) if config.interface in STAMPED else self._arrival
-        self._receiver = Receiver(name, config.bitrate, self._watch, self.counters, self._frame_clock)
+        self._receiver = Receiver(name, config.bitrate, self._watch, self.counters, self._frame_clock, lengths)
         self._handle = self._receiver.handle
         self._kernel = Kernel(config.interface, config.channel)
         self._can: can.BusABC | None = None
@@ -114,6 +117,11 @@ class Bus:
     def state(self) -> BusState:
         """State of the bus."""
         return self._watch.state
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether the bus carries frames of CAN FD too."""
+        return self._config.is_fd
 
     @property
     def text(self) -> str:
@@ -249,9 +257,7 @@ class Bus:
 
     def _new_interface(self) -> can.BusABC:
         config = self._config
-        self._can = interface = can.Bus(
-            config.channel, config.interface, ignore_config=True, bitrate=config.bitrate, **config.options
-        )
+        self._can = interface = open_interface(config)
         set_buffers(interface)
         self._kernel = Kernel(config.interface, config.channel)
         self._kernel.filter(interface, self._receiver.routes)

@@ -6,8 +6,8 @@ import math
 import can
 
 from hal.protocols import cia301
+from hal.protocols.can_frames import LONGEST, FrameLengths
 from hal.protocols.error_frames import error_frame
-from hal.wire.budget import frame_bits
 from hal.wire.routes import EXTENDED, Routes, name_of
 from hal.wire.stamps import ArrivalClock, FrameClock
 from hal.wire.state import BusState, BusWatch
@@ -21,8 +21,6 @@ STATISTICS_PERIOD = 1.0
 HIGH_LOAD = 0.8
 """Above this share of the bit rate frames wait long for each other."""
 
-_BITS = tuple(frame_bits(size) for size in range(9))
-_BITS_EXTENDED = tuple(frame_bits(size, is_extended=True) for size in range(9))
 _OURS = (cia301.SYNC, cia301.HEARTBEAT + OWN_NODE)
 _NODES = range(cia301.HEARTBEAT + 1, cia301.HEARTBEAT + OWN_NODE)
 
@@ -31,7 +29,13 @@ class Receiver:
     """Receiver of the frames of one bus; runs in its receive thread."""
 
     def __init__(
-        self, name: str, bitrate: int, watch: BusWatch, counters: dict[str, int], frame_clock: FrameClock | ArrivalClock
+        self,
+        name: str,
+        bitrate: int,
+        watch: BusWatch,
+        counters: dict[str, int],
+        frame_clock: FrameClock | ArrivalClock,
+        lengths: FrameLengths,
     ) -> None:
         """Prepare.
 
@@ -41,6 +45,7 @@ class Receiver:
             watch: State of the bus, updated here.
             counters: Counters, updated in place.
             frame_clock: Clock that converts the stamps of frames.
+            lengths: Lengths of the frames of the bus.
         """
         self.routes = Routes(name)
         self.heard = -math.inf
@@ -55,8 +60,9 @@ class Receiver:
         self._watch = watch
         self._counters = counters
         self._frame_clock = frame_clock
-        self._bits = 0
-        self._last: tuple[float, int, int | None] = (0.0, 0, None)
+        self._lengths = lengths
+        self._bits = 0.0
+        self._last: tuple[float, float, int | None] = (0.0, 0.0, None)
         self._logged = -math.inf
 
     def handle(self, message: can.Message, now: float) -> None:
@@ -69,15 +75,14 @@ class Receiver:
         counters["received"] += 1
         data = message.data
         size = len(data)
-        if message.is_remote_frame or message.is_fd or size > 8:
+        lengths = self._lengths
+        if message.is_remote_frame or (not lengths.is_fd if message.is_fd else size > LONGEST):
             counters["ignored"] += 1
             return
         identifier = message.arbitration_id
         if message.is_extended_id:
             identifier |= EXTENDED
-            self._bits += _BITS_EXTENDED[size]
-        else:
-            self._bits += _BITS[size]
+        self._bits += lengths.of(size, message.is_extended_id, message.is_fd)
         if self._watch.state is not BusState.OK:
             self._watch.heard(now)
         received = self._frame_clock.received(message.timestamp, now)
@@ -99,12 +104,12 @@ class Receiver:
             except BaseException as error:  # after any error of a handler the next frame must be handled
                 self._on_broken_handler(identifier, error, now)
 
-    def update_statistics(self, now: float, sent_bits: int, kernel_count: int | None = None) -> None:
+    def update_statistics(self, now: float, sent_bits: float, kernel_count: int | None = None) -> None:
         """Compute the load, and warn of frames that should not be on the bus.
 
         Args:
             now: Monotonic time [s].
-            sent_bits: Longest length of all frames that the HAL ever sent [bit].
+            sent_bits: Longest length of all frames that the HAL ever sent [bit at the bit rate of the bus].
             kernel_count: Frames that the kernel ever received, including filtered ones; None if unknown.
         """
         self.statistics_due = now + STATISTICS_PERIOD
@@ -116,7 +121,7 @@ class Receiver:
         if not 0 < passed < 10 * STATISTICS_PERIOD:
             return
         filtered = 0 if unseen is None or unseen_before is None else max(unseen - unseen_before, 0)
-        self.load = (bits - bits_before + filtered * _BITS[8]) / (passed * self._bitrate)
+        self.load = (bits - bits_before + filtered * self._lengths.classic[LONGEST]) / (passed * self._bitrate)
         warning = ""
         if self.load > HIGH_LOAD:
             warning = f"The bus is loaded to {self.load:.0%}. Does a node send more than configured?"

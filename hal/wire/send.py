@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import can
 
-from hal.wire.budget import frame_bits
+from hal.protocols.can_frames import FD_SIZES, LONGEST, FrameLengths
 
 PAUSE = 0.0002
 """A full interface is tried again after this time [s]; a frame at 1 Mbit/s needs about 0.1 ms."""
@@ -30,7 +30,6 @@ STUCK = 1.0
 BETWEEN_LOOKS = 0.2
 """Of the time between two looks at most this much counts [s]: a machine that stands still stops both threads."""
 
-_BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)
 _BUSY = can.CanOperationError("the interface is still busy with another frame", errno.EBUSY)
 
@@ -38,10 +37,17 @@ _BUSY = can.CanOperationError("the interface is still busy with another frame", 
 class Sender:
     """Sender for all threads; never raises, and never blocks the cycle longer than its pauses."""
 
-    def __init__(self, counters: dict[str, int], failed: Callable[[str], None]) -> None:
-        """Prepare; `counters` has `sent` and `send_failures`, `failed` is called with the reason of a failure."""
-        self.bits = 0
-        """Sum of the longest lengths of all sent frames [bit]."""
+    def __init__(self, counters: dict[str, int], failed: Callable[[str], None], lengths: FrameLengths) -> None:
+        """Prepare.
+
+        Args:
+            counters: It has `sent` and `send_failures`, updated in place.
+            failed: This is called with the reason of a failure.
+            lengths: Lengths of the frames of the bus.
+        """
+        self.bits = 0.0
+        """Sum of the longest lengths of all sent frames [bit at the bit rate of the bus]."""
+        self._lengths = lengths
         self.is_barred = False
         """Whether the controller is off the bus, so that no frame is sent."""
         self._counters = counters
@@ -90,10 +96,7 @@ class Sender:
         if self._interface is None or self.is_barred or self._failure:
             self._counters["send_failures"] += 1
             return False
-        size = len(message.data)
-        if size > 8:
-            self._counters["send_failures"] += 1
-            self._failed(f"Frame {message.arbitration_id:03X}h has {size} data bytes; a classic frame has at most 8.")
+        if not self._fits(message):
             return False
         error = self._try(message, patience)
         pauses = round(patience / PAUSE)
@@ -112,8 +115,24 @@ class Sender:
         if self._failures:
             self._failures.pop(message.arbitration_id, None)
         self._counters["sent"] += 1
-        self.bits += _BITS[size]
+        self.bits += self._lengths.of(len(message.data), message.is_extended_id, message.is_fd)
         return True
+
+    def _fits(self, message: can.Message) -> bool:
+        """Return whether the bus has such frames; if not, it is counted, and the reason is passed on."""
+        size = len(message.data)
+        if size in FD_SIZES and self._lengths.is_fd if message.is_fd else size <= LONGEST:
+            return True
+        self._counters["send_failures"] += 1
+        text = f"Frame {message.arbitration_id:03X}h has {size} data bytes; "
+        if not message.is_fd:
+            text += f"a classic frame has at most {LONGEST}."
+        elif self._lengths.is_fd:
+            text += f"one of CAN FD has {', '.join(map(str, FD_SIZES))}."
+        else:
+            text += "it is one of CAN FD, and the bus has no data_bitrate."
+        self._failed(text)
+        return False
 
     def _try(self, message: can.Message, patience: float) -> Exception | None:
         """Pass a frame to the interface as soon as no other thread uses it, and return an error."""

@@ -6,7 +6,8 @@ from typing import Protocol, runtime_checkable
 from simulators.nodes.canopen.spec import NodeSpec
 
 Frame = tuple[int, bytes]
-"""A frame is identifier and data; an identifier of 29 bits has `EXTENDED` set."""
+"""A frame is identifier and data; an identifier of 29 bits has `EXTENDED` set, and that of a sent frame of CAN FD has
+`simulators.wire_time.FD`."""
 Handler = Callable[[bytes, float], None]
 """A handler is called with a frame's data and the time [s]."""
 EXTENDED = 1 << 31

@@ -7,6 +7,7 @@ from hal import registry
 from hal.config import RobotConfig, load_robot
 from hal.drivers.cia402.drive import Cia402Drive
 from hal.errors import ConfigError
+from hal.protocols.can_frames import frame_bits
 from hal.robot import open_robot
 from hal.wire import budget
 
@@ -15,7 +16,7 @@ MUSASHI = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 
 @pytest.mark.parametrize(("size", "bits"), [(0, 55), (1, 65), (2, 75), (4, 95), (5, 105), (8, 135)])
 def test_worst_frames_on_the_wire(size, bits):
-    assert budget.frame_bits(size) == bits
+    assert frame_bits(size) == bits
 
 
 def test_the_musashi_arm_takes_under_half_of_each_bus():

@@ -6,6 +6,7 @@ from hal_bench import description
 from hal.config import RobotConfig
 from hal.drivers.can_device import CanDevice
 from hal.errors import ConfigError
+from hal.protocols.can_frames import frame_bits
 from hal.wire import budget
 
 RATE = 200.0
@@ -31,7 +32,7 @@ class Chatterbox(CanDevice):
     ("size", "extended", "bits"), [(0, False, 55), (8, False, 135), (0, True, 80), (1, True, 90), (8, True, 160)]
 )
 def test_worst_frames_with_short_and_long_identifiers(size, extended, bits):
-    assert budget.frame_bits(size, extended) == bits
+    assert frame_bits(size, extended) == bits
 
 
 def chatterboxes(count=1, **bus):

@@ -15,6 +15,7 @@ from can.interfaces.virtual import VirtualBus
 
 from hal.clock import SystemClock
 from hal.config import BusConfig
+from hal.protocols.can_frames import CLASSIC
 from hal.wire.bus import Bus
 from hal.wire.kernel import IN_FLIGHT, set_buffers
 from hal.wire.send import FAILED_SENDS, PAUSE, PAUSES, Sender
@@ -170,7 +171,7 @@ def test_an_interface_that_hangs_while_sending_is_shut_and_opened_again(bus, int
 
 
 def test_an_interface_is_not_blocked_while_the_whole_machine_stands_still(bus, interface, monkeypatch):
-    sender = Sender({"sent": 0, "send_failures": 0}, print)
+    sender = Sender({"sent": 0, "send_failures": 0}, print, CLASSIC)
     sender.use(bus._can)
     interface.is_stuck.set()
     sending = threading.Thread(target=sender.send, args=(frame(),))
@@ -191,7 +192,7 @@ def test_an_interface_is_not_blocked_while_the_whole_machine_stands_still(bus, i
 
 def test_a_frame_that_is_too_long_is_refused_and_no_fault_of_the_interface(bus, interface):
     report = []
-    sender = Sender({"sent": 0, "send_failures": 0}, report.append)
+    sender = Sender({"sent": 0, "send_failures": 0}, report.append, CLASSIC)
     sender.use(bus._can)
     for _ in range(2 * FAILED_SENDS):
         assert not sender.send(frame(data=bytes(9)))

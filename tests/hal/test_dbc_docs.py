@@ -80,7 +80,7 @@ def test_an_axis_of_the_example_works_on_the_bench():
 
 
 def test_the_budget_counts_what_the_axis_sends():
-    robot = open_robot(robot_file(ODRIVE))
-    settings = robot._devices[0]._settings
-    sent = sum(rate for _, rate, _ in type(robot._devices[0]).traffic(settings, 200.0))
+    config = robot_file(ODRIVE)
+    axis = open_robot(config)._devices[0]
+    sent = sum(frames.rate for frames in type(axis).traffic_of(axis._settings, 200.0, (), config.folder))
     assert sent == pytest.approx(10 + 100 + 50 + 2 + 200)  # frames per second

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from dbc_file import SENSOR, SERVO, settings
+from dbc_file import FILE, SENSOR, SERVO, settings
 from dbc_wire import ANGLE, BUSY, GO, MOTION, NODE, OFF, ON, STATUS, TURN_OFF, TURN_ON
 
 from hal.device import DeviceState
@@ -11,6 +11,7 @@ from hal.drivers.dbc.sensor import DbcNode
 from hal.drivers.dbc.servo import DISABLE, ENABLE, QUICK_STOP, RESET, DbcServo
 from hal.drivers.dbc.settings import DbcSettings, ServoSettings
 from hal.errors import ConfigError
+from hal.protocols.can_frames import Frames
 
 
 def follow(wire, value, status=None):
@@ -247,14 +248,21 @@ def test_a_motor_is_damped_against_its_velocity(open_wire):
     assert not open_wire(DbcServo, SERVO).device.can_damp
 
 
-def test_bytes_and_rates_of_the_bus(open_wire):
-    """Each frame counts with 8 bytes; a servo also gets its set-point and its cyclic frames."""
+def test_bytes_and_rates_of_the_bus(tmp_path):
+    """A servo also gets its set-point, its cyclic messages and frames."""
+    (tmp_path / "node.dbc").write_text(FILE)
     sensor = settings(DbcSettings, SENSOR)
-    assert DbcNode.traffic(sensor, 200.0) == ((8, pytest.approx(200.0), False), (8, pytest.approx(10.0), False))
-    cyclic = settings(ServoSettings, SERVO, cyclic=[{"frame": {"id": 6}}], extended=True)
-    assert DbcServo.traffic(cyclic, 100.0) == (
-        (8, 100.0, True),
-        (8, pytest.approx(20.0), True),
-        (8, 100.0, True),
-        (8, 100.0, True),
+    assert DbcNode.traffic_of(sensor, 200.0, (), tmp_path) == (
+        Frames(8, pytest.approx(200.0)),
+        Frames(2, pytest.approx(10.0)),
+    )
+    steps = [{"frame": {"id": 6, "data": [1, 2, 3]}}, {"frame": {"id": 7, "broadcast": True}}, {"send": "Push"}]
+    cyclic = settings(ServoSettings, SERVO, cyclic=steps, extended=True)
+    assert DbcServo.traffic_of(cyclic, 100.0, (), tmp_path) == (
+        Frames(4, 100.0, True),
+        Frames(2, pytest.approx(20.0), True),
+        Frames(6, 100.0, True),
+        Frames(2, 100.0, True),
+        Frames(3, 100.0, True),
+        Frames(0, 100.0, False),
     )

@@ -213,3 +213,12 @@ def test_an_upload_that_is_refused_or_never_ends():
         assert endless.answer(bytes([toggle << 4]) + b"x" * 7)
         toggle ^= 1
     assert "does not end" in endless.refused
+
+
+def test_a_frame_of_can_fd_under_an_identifier_of_canopen_is_none_of_canopen(book):
+    """A heartbeat, a PDO and an SDO request are classic frames."""
+    for identifier in (0x703, 0x183, 0x603):
+        assert describe(frame(identifier, "05" * 8, is_fd=True), book).kind == "CAN FD"
+    before = dict(book.pdos)
+    book.learn(frame(0x603, "23 00 1A 01 20 00 64 60", is_fd=True))
+    assert book.pdos == before

@@ -1,6 +1,7 @@
 """What a drive's numbers are worth, by arithmetic done by hand."""
 
 import math
+from pathlib import Path
 
 import pytest
 from drive_bench import ELBOW, HOMING, SETTINGS, joint_description
@@ -60,9 +61,9 @@ def test_what_does_not_fit_is_cut():
 def test_traffic_is_that_of_the_quantities_which_the_file_names():
     settings = DriveSettings.model_validate({**SETTINGS, "temperature": {"object": "2200h:1", "every": 20}})
     beat = (1, 10.0)
-    assert Cia402Drive.traffic_of(settings, 200.0, ("position",)) == ((6, 200.0), (6, 200.0), beat)
+    assert Cia402Drive.traffic_of(settings, 200.0, ("position",), Path()) == ((6, 200.0), (6, 200.0), beat)
     every = ((6, 200.0), (8, 200.0), (8, 200.0), (2, 10.0), beat)
-    assert Cia402Drive.traffic_of(settings, 200.0, settings.quantities) == every
+    assert Cia402Drive.traffic_of(settings, 200.0, settings.quantities, Path()) == every
     (one,) = budget.budgets(RobotConfig.model_validate(joint_description(quantities=("position",))))
     (all_of_them,) = budget.budgets(RobotConfig.model_validate(joint_description()))
     assert all_of_them.bits > one.bits

@@ -14,6 +14,7 @@ from hal.errors import BusGone, ConfigError
 from hal.finding.dbc_nodes import DbcDevice, dbc_devices
 from hal.finding.scan import EXTENDED, compare, scan
 from hal.finding.tap import Tap
+from hal.protocols.can_frames import fd_bits
 from simulators.nodes.canopen.spec import CellConstants, NodeSpec
 from simulators.rig import Rig
 
@@ -262,3 +263,14 @@ def test_identifiers_of_29_bits_are_listed_and_belong_to_dbc_nodes():
     assert list(found.named) == ["axis"]
     assert {0x604, 0x606} <= asked
     assert 0x605 not in asked  # a frame that the axis would take for its own
+
+
+def test_frames_of_can_fd_load_the_bus_and_are_no_nodes_of_canopen():
+    config = BusConfig(interface="virtual", channel=f"scan_{next(_numbers)}", data_bitrate=1_000_000)
+    with bus(config) as (tap, wire):
+        for _ in range(10):
+            wire.send(can.Message(arbitration_id=0x705, data=bytes(64), is_fd=True, is_extended_id=False))
+        result = scan(tap, listen=0.2, ask=False)
+    assert not result.nodes
+    assert result.unknown == {0x705: pytest.approx(50.0)}
+    assert result.load == pytest.approx(10 * sum(fd_bits(64)) / 0.2e6)

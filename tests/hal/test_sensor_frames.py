@@ -3,6 +3,7 @@
 import contextlib
 import math
 import time
+from pathlib import Path
 
 import pytest
 from puppet import NODE, ROBOTS, driven, report
@@ -253,8 +254,8 @@ def test_traffic_of_the_channels_in_use():
     settings = Cia404Cell.Settings.model_validate({"eds": "e", "channels": [1, 2, 3], "preset": "int16"})
     names = Cia404Cell.quantities(settings)
     assert names == ("force_1", "force_2", "force_3")
-    assert Cia404Cell.traffic_of(settings, 200.0, names) == ((6, 200.0), (3, 200.0), (1, pytest.approx(10.0)))
-    assert Cia404Cell.traffic_of(settings, 200.0, ("force_2",)) == ((3, 200.0), (1, pytest.approx(10.0)))
+    assert Cia404Cell.traffic_of(settings, 200.0, names, Path()) == ((6, 200.0), (3, 200.0), (1, pytest.approx(10.0)))
+    assert Cia404Cell.traffic_of(settings, 200.0, ("force_2",), Path()) == ((3, 200.0), (1, pytest.approx(10.0)))
 
 
 def test_units_and_digits_of_a_cell():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from on_bench import arrives, cycle_until, running, states, virtual
 
+from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.protocols.dbc import load
 from simulators.nodes.dbc.frames import Output, decoded, raw_of
@@ -207,6 +208,20 @@ def test_a_servo_follows_each_kind_of_set_point(tmp_path: Path, quantity: str) -
         assert states(robot) == {"axis": "enabled"}
         robot.disable()
         cycle_until(robot, lambda one: states(robot) == {"axis": "ready"})
+
+
+@pytest.mark.long
+def test_a_servo_with_frames_of_can_fd_on_a_bus_with_the_timing_of_one(tmp_path: Path) -> None:
+    body = servo(tmp_path, "position")
+    wide = SERVO.replace("Status: 8", "Status: 24").replace("15|24@0-", "151|24@0-").replace("Demand: 4", "Demand: 10")
+    (tmp_path / "load_cell.dbc").write_text(wide)
+    body["buses"]["can0"].update(
+        interface="hub", channel=str(tmp_path / "can"), data_bitrate=4_000_000, options={"bit_timing": True}
+    )
+    with running(RobotConfig.model_validate(body)) as (robot, _):
+        cycle_until(robot, lambda one: one.values["joint_position"][0] > 0.35, np.array([0.4]))
+        assert states(robot) == {"axis": "enabled"}
+        assert robot.health()["buses"]["can0"]["counters"]["ignored"] == 0
 
 
 @pytest.mark.long

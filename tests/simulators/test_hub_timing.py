@@ -4,8 +4,9 @@ import time
 import can
 import pytest
 
+from hal.protocols.can_frames import FD_SIZES, fd_bits
 from simulators.hub import HubBus, HubServer
-from simulators.wire_time import EXTENDED, REMOTE, Wire, arbitration, frame_bits
+from simulators.wire_time import EXTENDED, REMOTE, Wire, arbitration, fd_frame_bits, frame_bits
 
 
 def frame_bits_by_the_book(identifier, data, length):
@@ -39,6 +40,46 @@ def test_frame_length_equals_the_standard_written_out():
         if kind & REMOTE:
             data = b""
         assert frame_bits(identifier, data, length) == frame_bits_by_the_book(identifier, data, length)
+
+
+def fd_frame_bits_by_the_book(identifier, data):
+    """ISO 11898-1:2015 written out bit by bit: lengths at the two bit rates; the checksum's values do not matter."""
+    if identifier & EXTENDED:
+        head = f"0{identifier >> 18 & 0x7FF:011b}11{identifier & 0x3FFFF:018b}0101"
+    else:
+        head = f"0{identifier & 0x7FF:011b}00101"
+    body = f"0{FD_SIZES.index(len(data)):04b}" + "".join(f"{byte:08b}" for byte in data)
+    sent, at_bus = "", 0
+    for number, bit in enumerate(head + body):
+        sent += bit
+        if sent[-5:] in ("00000", "11111"):
+            sent += "1" if bit == "0" else "0"
+        if number + 1 == len(head):
+            at_bus = len(sent)
+    checksum = 4 + (21 if len(data) > 16 else 17)
+    fixed = len(range(0, checksum, 4))  # one before the stuff count, and one behind every four bits
+    return at_bus + 1 + 2 + 7 + 3, len(sent) - at_bus + checksum + fixed
+
+
+def test_length_of_a_frame_of_can_fd_equals_the_standard_written_out():
+    chance = random.Random(2)
+    for _ in range(3000):
+        data = bytes(chance.choice((0, 0xFF, chance.randrange(256))) for _ in range(chance.choice(FD_SIZES)))
+        kind = chance.choice((0, EXTENDED))
+        identifier = chance.randrange(1 << 29 if kind else 1 << 11) | kind
+        parts = fd_frame_bits(identifier, data)
+        assert parts == fd_frame_bits_by_the_book(identifier, data)
+        assert sum(parts) <= sum(fd_bits(len(data), bool(kind)))
+
+
+def test_a_long_frame_ends_sooner_if_its_data_are_sent_at_a_higher_bit_rate():
+    ends = []
+    for data_bitrate in (1_000_000, 5_000_000):
+        wire = Wire(1_000_000, data_bitrate)
+        wire.push_fd(0.0, "a", 0x100, bytes(range(64)), b"")
+        ends.append(wire.due() if wire.advance(0.0) == [] else None)
+    at_bus, at_data = fd_frame_bits(0x100, bytes(range(64)))
+    assert ends == pytest.approx([(at_bus + at_data) * 1e-6, at_bus * 1e-6 + at_data * 0.2e-6])
 
 
 @pytest.mark.parametrize("length", range(9))

@@ -5,6 +5,7 @@ import itertools
 import can
 import pytest
 
+from hal.protocols.can_frames import FD_SIZES
 from simulators.wire_faults import BUS_OFF, Chances, FaultyWire
 
 _numbers = itertools.count()
@@ -133,3 +134,16 @@ def test_error_frames_and_babble_reach_the_hal(ends):
     assert error.arbitration_id == BUS_OFF
     wire.wire.babble = lambda draw: [(0x123, draw.randbytes(2))] * 5
     assert [identifier for identifier, _ in wire.to_hal([])] == [0x123] * 5
+
+
+def test_a_broken_frame_of_can_fd_has_a_length_that_there_is(ends):
+    wire = ends()
+    wire.wire.chances = Chances(short=0.5, long=0.5, corrupt=0.5)
+    wire.wire.readdressed = {1: 2}
+    for _ in range(200):
+        wire.node.send(can.Message(arbitration_id=0x181, data=bytes(24), is_fd=True, is_extended_id=False))
+    wire.wire.to_hal(0.0)
+    messages = [wire.hal.recv(0) for _ in range(200)]
+    assert all(message.is_fd and message.arbitration_id == 0x182 for message in messages)
+    sizes = {len(message.data) for message in messages}
+    assert sizes <= set(FD_SIZES) and min(sizes) < 24 < max(sizes)

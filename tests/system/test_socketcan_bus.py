@@ -222,3 +222,29 @@ def test_a_transmit_queue_that_is_full_costs_little_and_is_told(bus: Bus, peer: 
     assert taken < 100
     assert worst < LATE
     wait_for(lambda: bus.counters["opened"] >= 2, "reopening")
+
+
+@needs_root
+def test_frames_of_can_fd_pass_both_ways_beside_classic_ones() -> None:
+    ip("set", "vcan1", "down")
+    ip("set", "vcan1", "mtu", "72", "up")
+    heard: list[bytes] = []
+    wide = can.Message(
+        arbitration_id=0x200, data=bytes(range(64)), is_fd=True, bitrate_switch=True, is_extended_id=False
+    )
+    bus = Bus("can1", BusConfig(interface="socketcan", channel="vcan1", data_bitrate=5_000_000), SystemClock())
+    bus.subscribe(0x181, lambda data, received: heard.append(bytes(data)))
+    try:
+        bus.open()
+        wait_for(lambda: bus.counters["opened"], "the interface")
+        subprocess.run(["cansend", "vcan1", "181##1" + "A5" * 48], check=True)
+        subprocess.run(["cansend", "vcan1", "181#0102"], check=True)
+        wait_for(lambda: len(heard) == 2, "both frames")
+        with can.Bus(interface="socketcan", channel="vcan1", fd=True) as peer:
+            wait_for(lambda: bus.send(wide), "the frame")
+            message = peer.recv(LIMIT)
+    finally:
+        bus.close()
+    assert heard == [b"\xa5" * 48, b"\x01\x02"]
+    assert message is not None
+    assert (bytes(message.data), message.is_fd, message.bitrate_switch) == (bytes(range(64)), True, True)

@@ -5,6 +5,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
@@ -103,7 +104,9 @@ class AnalogNode(CanopenNode):
 
     @classmethod
     @override
-    def traffic_of(cls, settings: Any, rate: float, quantities: tuple[str, ...]) -> tuple[tuple[int, float], ...]:
+    def traffic_of(
+        cls, settings: Any, rate: float, quantities: tuple[str, ...], folder: Path
+    ) -> tuple[tuple[int, float], ...]:
         channels = zip(settings.channels, cls.quantities(settings), strict=True)
         objects = [cls._objects(settings, number) for number, quantity in channels if quantity in quantities]
         return (*_map(objects).frames(rate), HEARTBEAT)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import can
@@ -134,7 +135,7 @@ class Cia402Drive(CanopenNode):
     @classmethod
     @override
     def traffic_of(
-        cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
+        cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...], folder: Path
     ) -> tuple[tuple[int, float], ...]:
         pdos = settings.pdo.map("pdo") if settings.pdo else settings.pdos(quantities)
         return (*pdos.frames(rate), HEARTBEAT)

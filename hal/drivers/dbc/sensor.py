@@ -3,8 +3,10 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import ClassVar
 
+from cantools.database import Message
 from typing_extensions import override
 
 from hal.device import Check, DeviceState
@@ -13,6 +15,7 @@ from hal.drivers.dbc.sequence import Address, Inbox, InputMessage, Raws, Sequenc
 from hal.drivers.dbc.settings import MOTION, DbcSettings, QuantityConfig, StepConfig
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import dbc
+from hal.protocols.can_frames import Frames
 from hal.wire.bus import Handler
 
 PERIODS_WAITED = 3.0
@@ -23,8 +26,6 @@ ANSWER_TIME = 0.3
 """A request for the identity is repeated after this time [s]."""
 TRIES = 2
 """The identity is requested at most this many times."""
-FRAME_BYTES = 8
-"""The bus budget, which does not open the DBC file, counts every frame with this number of data bytes."""
 LATE = 1.5
 """`inspect` reports a message whose period is longer than this multiple of the stated one."""
 PACE = 50
@@ -52,9 +53,14 @@ class DbcNode(CanDevice):
 
     @classmethod
     @override
-    def traffic(cls, settings: DbcSettings, rate: float) -> tuple[tuple[int, float, bool], ...]:
-        rates = [rate if period == "cycle" else 1.0 / period for period in settings.periods.values()]
-        return tuple((FRAME_BYTES, frequency, bool(settings.extended)) for frequency in rates)
+    def traffic_of(
+        cls, settings: DbcSettings, rate: float, quantities: tuple[str, ...], folder: Path
+    ) -> tuple[Frames, ...]:
+        file = dbc.load(folder / settings.dbc)
+        return tuple(
+            frames_of(file.message(name), rate if period == "cycle" else 1.0 / period, settings.extended)
+            for name, period in settings.periods.items()
+        )
 
     def __init__(self, place: Place, settings: DbcSettings) -> None:
         super().__init__(place, settings)
@@ -67,6 +73,8 @@ class DbcNode(CanDevice):
             self._inbox = Inbox(dbc.load(place.folder / settings.dbc))
             self._prepare(settings)
             self._inbox.seal()
+            for message in self._inbox.messages.values():
+                self._check_kind(message.definition.name, dbc.is_fd(message.definition))
             self._subscribe()
         except ConfigError as error:
             raise ConfigError(f"Device {place}: {error}") from None
@@ -120,7 +128,22 @@ class DbcNode(CanDevice):
         return 0.0 if period == "cycle" else period
 
     def _steps(self, steps: Sequence[StepConfig]) -> tuple[Step, ...]:
-        return compile_steps(steps, self._inbox, self._address, self._rate)
+        compiled = compile_steps(steps, self._inbox, self._address, self._rate)
+        for step in compiled:
+            self._check_kind(step.text, step.frame is not None and step.frame.is_fd)
+        return compiled
+
+    def _check_kind(self, what: str, is_fd: bool) -> None:
+        """Check that the bus carries frames of CAN FD, if a frame is one.
+
+        Raises:
+            ConfigError: It does not.
+        """
+        if is_fd and not self._bus.is_fd:
+            raise ConfigError(
+                f"{what} is a frame of CAN FD, and bus '{self._bus.name}' carries classic frames only. Set "
+                f"buses.{self._bus.name}.data_bitrate to the bit rate of the data, if the adapter is one for CAN FD."
+            )
 
     def _subscribe(self) -> None:
         for message in self._inbox.messages.values():
@@ -309,6 +332,12 @@ class DbcNode(CanDevice):
                 what, False, f"It comes every {measured:.3g} s, but `periods` has {stated:g} s. Set the device's rate."
             )
         return Check(what, True, f"every {measured:.3g} s")
+
+
+def frames_of(message: Message, rate: float, extended: bool | None) -> Frames:
+    """Return the frames of a DBC message that is sent at a rate [Hz]; `extended` as in `Address`."""
+    is_extended = message.is_extended_frame if extended is None else extended
+    return Frames(dbc.size_of(message), rate, is_extended, dbc.is_fd(message))
 
 
 def _merge(before: Raws, now: Raws) -> Raws:

@@ -10,7 +10,7 @@ from cantools.database.can.signal import Signal
 
 from hal.drivers.dbc.settings import ConditionConfig, FrameConfig, StepConfig
 from hal.errors import ConfigError
-from hal.protocols.dbc import Dbc, SignalReader, Writer, describe
+from hal.protocols.dbc import Dbc, SignalReader, Writer, describe, is_fd
 
 TOLERANCE = 1e-6
 """Two values that are not whole numbers are equal within this relative difference."""
@@ -205,7 +205,8 @@ def message_of(dbc: Dbc, address: Address, name: str, data: bytearray) -> can.Me
     """
     message = dbc.message(name)
     identifier, extended = address.identifier(message.frame_id, message.is_extended_frame, f"message '{name}'")
-    return can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
+    fd = is_fd(message)
+    return can.Message(arbitration_id=identifier, is_extended_id=extended, is_fd=fd, bitrate_switch=fd, data=data)
 
 
 def compile_steps(steps: Sequence[StepConfig], inbox: Inbox, address: Address, rate: float) -> tuple[Step, ...]:
@@ -231,6 +232,11 @@ def compile_steps(steps: Sequence[StepConfig], inbox: Inbox, address: Address, r
         unless = inbox.condition(step.unless) if step.unless else None
         compiled.append(Step(frame, until, unless, cycles, text))
     return tuple(compiled)
+
+
+def is_extended(config: FrameConfig, extended: bool | None) -> bool:
+    """Whether a frame of the robot file has an identifier of 29 bits; `extended` as in `Address`."""
+    return config.id > STANDARD if config.broadcast or extended is None else extended
 
 
 def _raw(config: FrameConfig, address: Address) -> can.Message:

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -10,10 +11,12 @@ from typing_extensions import override
 
 from hal.device import UNDER_POWER, Check, DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.dbc.sensor import FRAME_BYTES, POLL, DbcNode
-from hal.drivers.dbc.sequence import InputMessage, Raws, SequenceRun, Step, message_of
+from hal.drivers.dbc.sensor import POLL, DbcNode, frames_of
+from hal.drivers.dbc.sequence import InputMessage, Raws, SequenceRun, Step, is_extended, message_of
 from hal.drivers.dbc.settings import DbcSettings, QuantityConfig, ServoSettings, Value
 from hal.errors import ConfigError, DeviceSilent
+from hal.protocols import dbc
+from hal.protocols.can_frames import Frames
 from hal.protocols.dbc import Writer
 
 log = logging.getLogger(__name__)
@@ -42,10 +45,19 @@ class DbcServo(DbcNode):
 
     @classmethod
     @override
-    def traffic(cls, settings: DbcSettings, rate: float) -> tuple[tuple[int, float, bool], ...]:
+    def traffic_of(
+        cls, settings: DbcSettings, rate: float, quantities: tuple[str, ...], folder: Path
+    ) -> tuple[Frames, ...]:
         assert isinstance(settings, ServoSettings)
-        sent = (FRAME_BYTES, rate, bool(settings.extended))
-        return (*super().traffic(settings, rate), *(sent for _ in (settings.command, *settings.cyclic)))
+        file, received = dbc.load(folder / settings.dbc), super().traffic_of(settings, rate, quantities, folder)
+        names = [settings.command.send, *(step.send for step in settings.cyclic if step.send is not None)]
+        sent = [frames_of(file.message(name), rate, settings.extended) for name in names]
+        raw = [
+            Frames(len(frame.data), rate, is_extended(frame, settings.extended))
+            for step in settings.cyclic
+            if (frame := step.frame) is not None
+        ]
+        return (*received, *sent, *raw)
 
     def __init__(self, place: Place, settings: ServoSettings) -> None:
         self._enable_requested = False
@@ -96,6 +108,7 @@ class DbcServo(DbcNode):
         message = dbc.message(command.send)
         self._writer = Writer(dbc, message, command.values, command.signal)
         self._frame = message_of(dbc, self._address, command.send, self._writer.data)
+        self._check_kind(command.send, self._frame.is_fd)
         measured = settings.quantities[command.quantity]
         config = QuantityConfig(
             signal=f"{command.send}.{command.signal}",

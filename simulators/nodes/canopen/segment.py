@@ -12,7 +12,7 @@ from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.kinds import make
 from simulators.nodes.node import EXTENDED, Frame, Handler
 from simulators.nodes.plant import Plant
-from simulators.wire_time import ERROR
+from simulators.wire_time import ERROR, FD
 
 _log = logging.getLogger(__name__)
 
@@ -144,9 +144,7 @@ class Segment:
             self._bus.send_frames(frames)
         elif self._bus is not None:
             for identifier, data in frames:
-                is_extended = bool(identifier & EXTENDED)
-                plain = identifier & ~EXTENDED
-                self._send(self._bus, can.Message(arbitration_id=plain, data=data, is_extended_id=is_extended))
+                self._send(self._bus, _message(identifier, data))
         self.counters["sent"] += len(frames)
 
     def _send(self, bus: can.BusABC, message: can.Message) -> None:
@@ -165,3 +163,15 @@ class Segment:
                 self.counters["reopened"] += 1
                 return
             pause.wait(_REOPEN)
+
+
+def _message(identifier: int, data: bytes) -> can.Message:
+    """Return the message of a frame of a node, whose identifier has flags."""
+    is_fd = bool(identifier & FD)
+    return can.Message(
+        arbitration_id=identifier & ~(EXTENDED | FD),
+        is_extended_id=bool(identifier & EXTENDED),
+        is_fd=is_fd,
+        bitrate_switch=is_fd,
+        data=data,
+    )

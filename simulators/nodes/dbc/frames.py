@@ -11,7 +11,7 @@ from cantools.database.can.signal import Signal
 
 from hal.drivers.dbc.settings import ConditionConfig, StepConfig, Value
 from hal.errors import ConfigError
-from hal.protocols.dbc import Dbc
+from hal.protocols.dbc import Dbc, size_of
 from simulators.nodes.node import EXTENDED, REMOTE
 
 LARGEST_STANDARD = 0x7FF
@@ -103,9 +103,8 @@ class Output:
             signal.name: values[signal.name] if signal.is_float else int(values[signal.name])
             for signal in self.definition.signals
         }
-        if not whole:
-            return bytes(self.definition.length)
-        return bytes(self.definition.encode(whole, scaling=False, strict=False))
+        data = b"" if not whole else bytes(self.definition.encode(whole, scaling=False, strict=False))
+        return data.ljust(size_of(self.definition), b"\0")
 
 
 class Numbering:

@@ -13,6 +13,7 @@ from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.dbc.frames import Numbering, Output, Request
 from simulators.nodes.node import Frame, Handler, SimulatedNode
 from simulators.nodes.plant import Plant
+from simulators.wire_time import FD
 
 MOST_AT_ONCE = 10
 """At most this many frames of one message are sent at once; after a longer pause the others are left out."""
@@ -86,7 +87,9 @@ class DbcNode(SimulatedNode):
     def _message(self, name: str) -> Output:
         if name not in self._outputs:
             definition = self._dbc.message(name)
-            self._outputs[name] = Output(definition, self._numbering.of(definition))
+            self._outputs[name] = Output(
+                definition, self._numbering.of(definition) | (FD if dbc.is_fd(definition) else 0)
+            )
         return self._outputs[name]
 
     def _output(self, source: str) -> tuple[Output, str]:
