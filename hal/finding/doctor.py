@@ -329,7 +329,7 @@ def check_serial(what: str, bus: BusConfig) -> Iterator[Finding]:
 def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, commands: int) -> Iterator[Finding]:
     """Check a Linux CAN interface; `commands` frames are sent at once, in addition to the SYNC."""
     name = what.split()[-1]
-    up = link.up_command(bus.channel, "can" if state is None else state.kind, bus.bitrate)
+    up = link.up_command(bus.channel, "can" if state is None else state.kind, bus.bitrate, bus.data_bitrate)
     if state is None:
         known = ", ".join(link.known_links()) or "none"
         yield bad(
@@ -344,20 +344,31 @@ def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, com
     if not state.is_up:
         yield bad(what, f"'{bus.channel}' is down. Set it up with `{up}`.")
         return
+    if bus.is_fd and state.mtu is not None and state.mtu < link.FD_MTU:
+        yield bad(what, f"'{bus.channel}' takes classic frames only. `sudo ip link set {bus.channel} down; {up}`")
+        return
     yield ok(what, f"'{bus.channel}' ({state.kind or 'CAN'}) is up.")
     if state.kind == "can":
-        if state.bitrate != bus.bitrate:
-            yield bad(
-                f"bit rate {name}",
-                f"{state.bitrate} bit/s, and the robot file says {bus.bitrate}. "
-                f"`sudo ip link set {bus.channel} down; {up}`",
-            )
-        else:
-            yield ok(f"bit rate {name}", f"{bus.bitrate / 1e3:g} kbit/s.")
+        yield from check_bit_rates(name, bus, state, up)
         yield from check_controller(name, state)
     if state.queue is not None and state.queue < commands + 2:
         more = f"sudo ip link set {bus.channel} txqueuelen {4 * (commands + 2)}"
         yield warning(f"queue {name}", f"{state.queue} frames, and {commands + 2} are sent at once. `{more}`")
+
+
+def check_bit_rates(name: str, bus: BusConfig, state: link.Interface, up: str) -> Iterator[Finding]:
+    """Check the bit rates of a controller; `up` is the command that sets them."""
+    rates = [("bit rate", state.bitrate, bus.bitrate)]
+    if bus.data_bitrate is not None:
+        rates.append(("bit rate of data", state.data_bitrate, bus.data_bitrate))
+    for what, own, stated in rates:
+        if own == stated:
+            yield ok(f"{what} {name}", f"{stated / 1e3:g} kbit/s.")
+            continue
+        yield bad(
+            f"{what} {name}",
+            f"{own} bit/s, and the robot file says {stated}. `sudo ip link set {bus.channel} down; {up}`",
+        )
 
 
 def check_controller(name: str, state: link.Interface) -> Iterator[Finding]:

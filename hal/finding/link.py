@@ -12,6 +12,8 @@ from typing import Any
 NET = Path("/sys/class/net")
 _ARPHRD_CAN = 280
 _UP = 1
+FD_MTU = 72
+"""An interface that takes frames of CAN FD has this largest frame [byte]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,8 @@ class Interface:
         restart: Time [s] after which a controller in bus-off starts again; 0 for never, None if unknown.
         state: State of the controller, such as `ERROR-ACTIVE`; empty if unknown.
         queue: Capacity of the send queue [frames]; None if unknown.
+        data_bitrate: Bit rate of the data of CAN FD frames [bit/s]; None if it is off or unknown.
+        mtu: Largest frame [byte]: 16 for classic ones, 72 for those of CAN FD; None if unknown.
     """
 
     name: str
@@ -37,6 +41,8 @@ class Interface:
     restart: float | None = None
     state: str = ""
     queue: int | None = None
+    data_bitrate: int | None = None
+    mtu: int | None = None
 
 
 def look_up(name: str) -> Interface | None:
@@ -72,13 +78,24 @@ def parse(output: list[dict[str, Any]]) -> Interface:
         restart=None if restart is None else restart / 1e3,
         state=data.get("state", ""),
         queue=entry.get("txqlen"),
+        data_bitrate=data.get("data_bittiming", {}).get("bitrate"),
+        mtu=entry.get("mtu"),
     )
 
 
-def up_command(name: str, kind: str, bitrate: int) -> str:
-    """Return the command that brings an interface up; only a controller has a bit rate [bit/s] and a restart."""
-    settings = f" type can bitrate {bitrate} restart-ms 100" if kind in ("can", "") else ""
-    return f"sudo ip link set {name} up{settings}"
+def up_command(name: str, kind: str, bitrate: int, data_bitrate: int | None = None) -> str:
+    """Return the command that brings an interface up; only a controller has bit rates [bit/s] and a restart.
+
+    Args:
+        name: Name of the interface.
+        kind: As in `Interface`.
+        bitrate: Bit rate of the bus.
+        data_bitrate: Bit rate of the data of CAN FD frames; None for classic frames only.
+    """
+    if kind not in ("can", ""):
+        return f"sudo ip link set {name}{'' if data_bitrate is None else f' mtu {FD_MTU}'} up"
+    fd = "" if data_bitrate is None else f" dbitrate {data_bitrate} fd on"
+    return f"sudo ip link set {name} up type can bitrate {bitrate}{fd} restart-ms 100"
 
 
 def known_links() -> list[str]:
@@ -89,7 +106,11 @@ def known_links() -> list[str]:
 def _from_sys(name: str, folder: Path) -> Interface:
     flags = _number(folder / "flags") or 0
     return Interface(
-        name, _number(folder / "type") == _ARPHRD_CAN, bool(flags & _UP), queue=_number(folder / "tx_queue_len")
+        name,
+        _number(folder / "type") == _ARPHRD_CAN,
+        bool(flags & _UP),
+        queue=_number(folder / "tx_queue_len"),
+        mtu=_number(folder / "mtu"),
     )
 
 

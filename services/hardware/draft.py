@@ -9,23 +9,35 @@ from hal.finding.scan import scan
 from hal.finding.serial_scan import scan_line
 from hal.finding.tap import Tap
 from hal.line import SERIAL
+from services.errors import BadArguments
 from services.model.artifacts import SHIPPED
 
 
-def bus_of(channel: str, bitrate: int) -> BusConfig:
-    """Return the bus of a channel of SocketCAN, or of `INTERFACE:CHANNEL`, with a bit rate [bit/s]."""
+def bus_of(channel: str, bitrate: int, data_bitrate: int | None = None) -> BusConfig:
+    """Return the bus of a channel of SocketCAN, or of `INTERFACE:CHANNEL`, with bit rates [bit/s].
+
+    Raises:
+        BadArguments: The bit rate of the data is below that of the bus.
+    """
     interface, colon, place = channel.rpartition(":")
-    return BusConfig(interface=interface if colon else "socketcan", channel=place, bitrate=bitrate)
+    return bus_with(interface if colon else "socketcan", place, bitrate, data_bitrate)
 
 
-def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: str | None, file: Path) -> Draft:
+def bus_with(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> BusConfig:
+    """Return the bus of an interface and a channel, otherwise as `bus_of`."""
+    if data_bitrate is not None and data_bitrate < bitrate:
+        raise BadArguments(
+            f"--data-bitrate {data_bitrate} is below --bitrate {bitrate}; data of CAN FD are not slower."
+        )
+    return BusConfig(interface=interface, channel=channel, bitrate=bitrate, data_bitrate=data_bitrate)
+
+
+def draft_devices(source: Path | None, bus: BusConfig | None, name: str | None, file: Path) -> Draft:
     """Return a robot file of the devices in a folder of vendors' files, or on a bus.
 
     Args:
         source: Folder with EDS, DCF and DBC files; None without one.
-        channel: Channel of SocketCAN, `INTERFACE:CHANNEL` of python-can, or `serial:/dev/ttyACM0` for a line of servos,
-            to scan; None to use the folder only.
-        bitrate: Bit rate of the bus [bit/s].
+        bus: The bus to scan, or the line of servos; None to use the folder only.
         name: Name of the robot; None for that of the robot file.
         file: Robot file to be written.
 
@@ -34,10 +46,9 @@ def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: 
         BusGone: The bus cannot be opened, or failed.
     """
     robot = name or robot_name(file.stem)
-    if channel is None:
+    if bus is None:
         assert source is not None
         return draft_folder(source, robot, file.parent, SHIPPED)
-    bus = bus_of(channel, bitrate)
     place = bus.channel
     label = re.sub(r"\W+", "_", Path(place).name) or "can0"
     if bus.interface in SERIAL:
@@ -46,7 +57,7 @@ def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: 
         with Tap(label, bus) as tap:
             result = scan(tap)
     real = f"interface: {bus.interface}, channel: {place}"
-    return draft_bus(result, real, bitrate, source, robot, file.parent, SHIPPED)
+    return draft_bus(result, real, bus, source, robot, file.parent, SHIPPED)
 
 
 def robot_name(text: str) -> str:

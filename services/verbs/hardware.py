@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, load, report_errors
+from services.verbs.verb import Connect, DataBitrate, RobotFile, load, report_errors
 
 calibrate = typer.Typer(no_args_is_help=True, help="Measure and store zero, direction and gain of a device.")
 can = typer.Typer(no_args_is_help=True, help="Show CAN buses.")
@@ -48,6 +48,7 @@ def scan(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = 1_000_000,
+    data_bitrate: DataBitrate = None,
     seconds: Annotated[
         float, typer.Option(min=0.1, max=60.0, help="Listening time before the first request \\[s].")
     ] = 1.5,
@@ -63,7 +64,7 @@ def scan(
     """
     from services.hardware.scan import run_scan
 
-    config, buses = _buses(robot, interface, channel, bitrate)
+    config, buses = _buses(robot, interface, channel, bitrate, data_bitrate)
     return run_scan(buses, config, seconds, not passive, mit)
 
 
@@ -138,6 +139,7 @@ def dump(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = 1_000_000,
+    data_bitrate: DataBitrate = None,
     bus: Annotated[str | None, typer.Option(help="Only this bus of the robot.")] = None,
     node: Annotated[int | None, typer.Option(min=0, help="Only frames of this node.")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Number of frames; no limit if not given.")] = None,
@@ -154,7 +156,7 @@ def dump(
     from services.errors import BadArguments
     from services.hardware.dump import DumpOptions, run_dump
 
-    config, buses = _buses(robot, interface, channel, bitrate)
+    config, buses = _buses(robot, interface, channel, bitrate, data_bitrate)
     if bus is not None:
         if bus not in buses:
             raise typer.BadParameter(f"There is no bus '{bus}'. Known: {', '.join(buses)}.")
@@ -164,19 +166,19 @@ def dump(
     return run_dump(buses, config, DumpOptions(node, count, seconds, summary))
 
 
-def _buses(robot: str | None, interface: str | None, channel: str | None, bitrate: int) -> tuple[Any, dict[str, Any]]:
+def _buses(
+    robot: str | None, interface: str | None, channel: str | None, bitrate: int, data_bitrate: int | None
+) -> tuple[Any, dict[str, Any]]:
     """Return the robot file and its buses; without a robot, None and the bus of the interface or channel."""
-    from hal.config import BusConfig
     from services.errors import BadArguments
+    from services.hardware.draft import bus_of, bus_with
 
     if (robot is None) == (interface is None):
         raise BadArguments(
             "Name either a robot, or --interface and --channel (`--interface socketcan --channel can0`), or can0 alone."
         )
     if robot is not None and not Path(robot).exists() and CHANNEL.fullmatch(robot):
-        from services.hardware.draft import bus_of
-
-        bus = bus_of(robot, bitrate)
+        bus = bus_of(robot, bitrate, data_bitrate)
         return None, {Path(str(bus.channel)).name: bus}
     if robot is not None:
         config = load(robot)
@@ -185,4 +187,4 @@ def _buses(robot: str | None, interface: str | None, channel: str | None, bitrat
         return config, dict(config.buses)
     if channel is None:
         raise BadArguments(f"--interface {interface} needs a --channel, such as can0.")
-    return None, {Path(channel).name: BusConfig(interface=str(interface), channel=channel, bitrate=bitrate)}
+    return None, {Path(channel).name: bus_with(str(interface), channel, bitrate, data_bitrate)}

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import Distribution, Domain, RosRouter, report_errors
+from services.verbs.verb import DataBitrate, Distribution, Domain, RosRouter, report_errors
 
 DESCRIBE = "simulators.robots.urdf_arm:describe"
 """The function that reads a URDF is named by this text, because services know simulators by name only."""
@@ -40,6 +40,7 @@ def init(
         ),
     ] = None,
     bitrate: Annotated[int, typer.Option(min=10_000, help="Bit rate of the scanned bus \\[bit/s].")] = 1_000_000,
+    data_bitrate: DataBitrate = None,
     ros2: Annotated[bool, typer.Option("--ros2", help="Draft the file from the topics of a ROS 2 network.")] = False,
     router: RosRouter = None,
     domain: Domain = None,
@@ -68,7 +69,9 @@ def init(
         raise BadArguments(f"'{source}' is not a URDF or MJCF file. A robot file is ready: `gemuco demo {source}`.")
     file = _new_file(out or Path(f"{_stem(source, scan)}.yaml"))
     if scan is not None or (source is not None and source.is_dir()):
-        _of_devices(source, scan, bitrate, name, file)
+        from services.hardware.draft import bus_of
+
+        _of_devices(source, None if scan is None else bus_of(scan, bitrate, data_bitrate), name, file)
     elif source is not None:
         _of_arm(source, tip, name, file)
 
@@ -121,12 +124,12 @@ def _of_arm(source: Path, tip: str | None, name: str | None, file: Path) -> None
     typer.echo(f"Next: gemuco demo {file}")
 
 
-def _of_devices(source: Path | None, scan: str | None, bitrate: int, name: str | None, file: Path) -> None:
+def _of_devices(source: Path | None, bus: Any, name: str | None, file: Path) -> None:
     from services.hardware.draft import draft_devices
 
     if name is not None:
         _check_name(name)
-    draft = draft_devices(source, scan, bitrate, name, file)
+    draft = draft_devices(source, bus, name, file)
     copies = {place: path.read_bytes() for place, path in draft.copies.items() if not (file.parent / place).exists()}
     _write(file, draft.text, copies)
     _report(file, draft.summary, draft.notes)

@@ -32,6 +32,10 @@ RosRouter = Annotated[
 Domain = Annotated[
     int | None, typer.Option(envvar="ROS_DOMAIN_ID", help="Domain of ROS 2; that of the robot file, or 0.")
 ]
+DataBitrate = Annotated[
+    int | None,
+    typer.Option(min=10_000, help="Bit rate of the data of CAN FD frames \\[bit/s]; classic CAN without it."),
+]
 Distribution = Annotated[
     str | None,
     typer.Option(

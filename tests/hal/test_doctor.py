@@ -173,6 +173,9 @@ def test_what_ip_prints_is_read():
     assert parse([{}, SHOWN]) == Interface("can0", True, True, "can", 500000, 0.1, "ERROR-ACTIVE", 10)
     virtual = {**SHOWN, "ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}
     assert parse([virtual]) == Interface("vcan0", True, True, "vcan", None, None, "", 10)
+    data = {**SHOWN["linkinfo"]["info_data"], "ctrlmode": ["FD"], "data_bittiming": {"bitrate": 4_000_000}}
+    wide = parse([{**SHOWN, "mtu": 72, "linkinfo": {"info_kind": "can", "info_data": data}}])
+    assert (wide.bitrate, wide.data_bitrate, wide.mtu) == (500000, 4_000_000, 72)
     with pytest.raises(LookupError):
         parse([])
 
@@ -194,6 +197,23 @@ def test_what_ip_prints_is_read():
 def test_a_linux_interface(changes, what, verdict, said):
     sound = Interface("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100)
     found = by_what(check_socketcan("interface can0", CAN0, replace(sound, **changes), 5))
+    assert found[what].verdict is verdict
+    assert said in found[what].text
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "verdict", "said"),
+    [
+        ({}, "bit rate of data can0", Severity.OK, "5000 kbit/s"),
+        ({"data_bitrate": 2_000_000}, "bit rate of data can0", Severity.BAD, "bitrate 1000000 dbitrate 5000000 fd on"),
+        ({"mtu": 16, "data_bitrate": None}, "interface can0", Severity.BAD, "classic frames only"),
+        ({"mtu": 16, "kind": "vcan"}, "interface can0", Severity.BAD, "ip link set can0 mtu 72 up"),
+    ],
+)
+def test_a_linux_interface_for_can_fd(changes, what, verdict, said):
+    bus = CAN0.model_copy(update={"data_bitrate": 5_000_000})
+    sound = Interface("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100, 5_000_000, 72)
+    found = by_what(check_socketcan("interface can0", bus, replace(sound, **changes), 5))
     assert found[what].verdict is verdict
     assert said in found[what].text
 

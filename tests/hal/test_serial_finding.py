@@ -7,7 +7,7 @@ import pytest
 import yaml
 from serial_bench import NAMES, SETTINGS, SerialBench, robot_file
 
-from hal.config import RobotConfig
+from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
 from hal.finding import serial_scan
 from hal.finding.doctor import Severity, check_devices, check_interfaces
@@ -101,7 +101,9 @@ def test_a_scan_becomes_a_robot_file_that_runs(make, tmp_path):
         result = scan_line("arm", bench.config.buses["arm"])
     finally:
         bench.unplug()
-    draft = draft_bus(result, "interface: serial, channel: /dev/ttyACM0", 1_000_000, None, "mine", tmp_path, tmp_path)
+    draft = draft_bus(
+        result, "interface: serial, channel: /dev/ttyACM0", BusConfig(channel="x"), None, "mine", tmp_path, tmp_path
+    )
     body = yaml.safe_load(draft.text)
     assert body["buses"]["arm"]["interface"] == "pty"
     body["buses"]["arm"]["channel"] = str(tmp_path / "line")

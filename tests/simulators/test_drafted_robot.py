@@ -252,13 +252,21 @@ def test_files_whose_identifiers_collide_are_on_buses_of_their_own(tmp_path: Pat
         assert set(states(robot)) == set(buses)
 
 
-def test_messages_of_can_fd_are_left_out_and_said(tmp_path: Path) -> None:
+def test_a_bus_with_messages_of_can_fd_has_a_bit_rate_of_their_data_to_be_set(tmp_path: Path) -> None:
+    """What does not fit into a frame of CAN FD either is left out."""
     (tmp_path / "files").mkdir()
-    long, short = dbc_of((5, "Long"), size=64), dbc_of((6, "Short"))
-    (tmp_path / "files" / "fd.dbc").write_text(long + short.partition("X\n")[2])
+    messages = [dbc_of((5, "Long"), size=60), dbc_of((6, "Short")), dbc_of((7, "Endless"), size=65)]
+    text = messages[0] + "".join(message.partition("X\n")[2] for message in messages[1:])
+    (tmp_path / "files" / "fd.dbc").write_text(text)
+    (tmp_path / "files" / "classic.dbc").write_text(dbc_of((6, "Other")))  # on a bus of its own
     draft = draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED)
-    assert load_robot(written(draft, tmp_path)).signals["force"].elements == ("fd_short",)
-    assert any("Long left out" in note and "CAN FD is not supported" in note for note in draft.notes)
+    config = virtual(body_of(written(draft, tmp_path)))
+    assert set(config.signals["force"].elements) == {"classic_other", "fd_long", "fd_short"}
+    assert {name: bus.data_bitrate for name, bus in config.buses.items()} == {"can0": None, "can1": 2_000_000}
+    assert any("Endless left out" in note and "at most 64" in note for note in draft.notes)
+    assert "fd.dbc: frames of CAN FD. Set data_bitrate to the bit rate of their data." in draft.notes
+    with running(config) as (robot, _):
+        cycle_until(robot, lambda one: np.isfinite(one.values["force"]).all())
 
 
 def test_a_file_of_a_whole_car_gives_some_signals_of_every_node(tmp_path: Path) -> None:
@@ -314,7 +322,15 @@ def test_a_bus_becomes_the_devices_that_answer(folder: Path, tmp_path: Path) -> 
             result = scan(tap, listen=1.0)
     finally:
         rig.stop()
-    draft = draft_bus(result, "interface: socketcan, channel: can0", 500_000, folder, "again", tmp_path, SHIPPED)
+    draft = draft_bus(
+        result,
+        "interface: socketcan, channel: can0",
+        BusConfig(channel="can0", bitrate=500_000),
+        folder,
+        "again",
+        tmp_path,
+        SHIPPED,
+    )
     robot = load_robot(written(draft, tmp_path))
     nodes = {name: (robot.kinds[device.kind].driver, device.node) for name, device in robot.devices.items()}
     assert nodes.pop("cell")[0] == "dbc"
@@ -331,7 +347,7 @@ def test_a_silent_bus_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"No node on can0 has a driver \(0 nodes, 0 other identifiers\)\. Are they.*Only listened"
     ):
-        draft_bus(result, "", 1_000_000, None, "none", tmp_path, SHIPPED)
+        draft_bus(result, "", BusConfig(channel="can0"), None, "none", tmp_path, SHIPPED)
 
 
 def test_a_name_is_a_text_in_yaml() -> None:

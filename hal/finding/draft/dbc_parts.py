@@ -11,7 +11,7 @@ from cantools.database.can.signal import Signal
 from hal.calibration.units import CONVERSIONS, NAMED, ROBOT_UNITS
 from hal.finding.draft.parts import STALE_AFTER, Measure, Names, Part
 from hal.finding.scan import EXTENDED
-from hal.protocols.dbc import Dbc
+from hal.protocols.dbc import Dbc, is_fd
 
 COMMAND = re.compile(r"cmd|command|request|set_?point|^set|_set_|target|demand|ctrl|control(?!.*stat)", re.IGNORECASE)
 """A message with such a name is one that the host sends."""
@@ -174,7 +174,8 @@ def _part(
     if slowest > 0.02:
         settings["silent_after"] = round(2 * STALE_PERIODS * slowest, 3)
     to_set = f"period of {_listed(unknown)}" if unknown else ""
-    return Part(name, "dbc", settings, node, tuple(measures), file.path.name, to_set)
+    fd = any(is_fd(message) for message in used)
+    return Part(name, "dbc", settings, node, tuple(measures), file.path.name, to_set, is_fd=fd)
 
 
 def _signals(messages: list[Message]) -> Iterator[tuple[Message, Signal]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hal.config import BusConfig
 from hal.errors import ConfigError
 from hal.finding.draft import dbc_parts, sheets
 from hal.finding.draft.parts import Measure, Names, Part
@@ -24,6 +25,8 @@ DEPTH = 3
 SHIPPED = {402: "servo_drive", 406: "joint_encoder", 404: "load_cell", 401: "analog_input"}
 """EDS files of this package, by device profile."""
 ODRIVE = "odrive_cansimple.dbc"
+DATA_BITRATE = 2_000_000
+"""A bus with frames of CAN FD has this bit rate of their data [bit/s] until the user sets it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,18 +154,18 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
     work.add_stand_in()
     count = f"{len(own)} file{'s' if len(own) > 1 else ''}"
     real = "interface: socketcan, channel: can0. Node ids are guessed: `gemuco scan` lists them."
-    return _finished(work, name, f"{count} in {source}", "can0", real, 1_000_000)
+    return _finished(work, name, f"{count} in {source}", "can0", real, BusConfig(channel="can0"))
 
 
 def draft_bus(
-    result: Scan, channel: str, bitrate: int, source: Path | None, name: str, folder: Path, shipped: Path
+    result: Scan, channel: str, rates: BusConfig, source: Path | None, name: str, folder: Path, shipped: Path
 ) -> Draft:
     """Return a robot file with one device for each node of a bus that a driver fits.
 
     Args:
         result: The scan.
         channel: Interface and channel, as YAML.
-        bitrate: Bit rate of the bus [bit/s].
+        rates: A bus with the bit rates of the scanned one.
         source: Folder with the files of vendors; None: EDS files of this package take their place.
         name: Name of the robot.
         folder: Folder of the robot file.
@@ -185,10 +188,10 @@ def draft_bus(
     if not work.parts:
         raise ConfigError(
             f"No node on {result.bus} has a driver ({len(result.nodes)} nodes, {len(result.unknown)} other "
-            f"identifiers). Are they powered, is the bit rate {bitrate}? {' '.join(work.notes)}".rstrip()
+            f"identifiers). Are they powered, is the bit rate {rates.bitrate}? {' '.join(work.notes)}".rstrip()
         )
     work.add_stand_in()
-    return _finished(work, name, f"the nodes on {result.bus}", result.bus, channel, bitrate)
+    return _finished(work, name, f"the nodes on {result.bus}", result.bus, channel, rates)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -313,9 +316,12 @@ def _add_node(work: _Draughtsman, node: Node, known: Sequence[Sheet]) -> None:
     work.parts.append(part)
 
 
-def _finished(work: _Draughtsman, name: str, source: str, bus: str, real: str, bitrate: int) -> Draft:
+def _finished(work: _Draughtsman, name: str, source: str, bus: str, real: str, rates: BusConfig) -> Draft:
     parts = work.parts
-    text = robot_text(name, source, bus, real, bitrate, parts, work.notes)
+    if rates.data_bitrate is None and (files := {part.origin: None for part in parts if part.is_fd}):
+        rates = rates.model_copy(update={"data_bitrate": DATA_BITRATE})
+        work.notes.append(f"{', '.join(files)}: frames of CAN FD. Set data_bitrate to the bit rate of their data.")
+    text = robot_text(name, source, bus, real, rates, parts, work.notes)
     drives = sum(part.is_drive for part in parts)
     to_set = sum(bool(part.to_set) for part in parts)
     summary = (

@@ -44,6 +44,7 @@ class Part:
         to_set: Settings that the user must replace, in words; empty if the file has all.
         is_drive: Whether it is commanded.
         bus: Number of its bus, from 0; a DBC file with identifiers of another file has one of its own.
+        is_fd: Whether it sends frames of CAN FD.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Part:
     to_set: str = ""
     is_drive: bool = False
     bus: int = 0
+    is_fd: bool = False
 
 
 def is_text(name: str) -> bool:

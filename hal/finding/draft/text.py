@@ -5,6 +5,7 @@ from typing import Any
 
 import yaml
 
+from hal.config import BusConfig
 from hal.finding.draft.parts import Part
 
 HEAD = """\
@@ -42,7 +43,13 @@ model:
 
 
 def robot_text(
-    robot: str, source: str, bus: str, real: str, bitrate: int, parts: Sequence[Part], notes: Sequence[str]
+    robot: str,
+    source: str,
+    bus: str,
+    real: str,
+    rates: BusConfig,
+    parts: Sequence[Part],
+    notes: Sequence[str],
 ) -> str:
     """Return the robot file of some devices, of which at least one is a drive.
 
@@ -51,7 +58,7 @@ def robot_text(
         source: What it was drafted from, in words.
         bus: Name of its bus; a number at its end is counted up for further ones.
         real: Interface and channel of the real bus, as YAML.
-        bitrate: Bit rate [bit/s].
+        rates: A bus with the bit rates of each; one without devices of CAN FD has none for its data.
         parts: The devices.
         notes: Sentences on what was left out or guessed.
     """
@@ -67,11 +74,17 @@ def robot_text(
         command=next(part.measures[0].signal for part in parts if part.is_drive),
         real=real,
         buses="".join(
-            f"  {name}: {{interface: {simulated}, channel: {robot}_{name}, bitrate: {bitrate}}}\n" for name in names
+            f"  {name}: {{interface: {simulated}, channel: {robot}_{name}, {_bit_rates(rates, number, parts)}}}\n"
+            for number, name in enumerate(names)
         ),
         kinds="".join(_kind(part) for part in parts),
         devices="".join(_device(part, names[part.bus]) for part in parts),
     )
+
+
+def _bit_rates(rates: BusConfig, number: int, parts: Sequence[Part]) -> str:
+    is_fd = any(part.is_fd for part in parts if part.bus == number)
+    return f"bitrate: {rates.bitrate}" + (f", data_bitrate: {rates.data_bitrate}" if is_fd else "")
 
 
 def _signals(parts: Sequence[Part]) -> list[str]:
