@@ -70,6 +70,7 @@ def explain(
     sudden: Hidden = frozenset(),
     begun: Hidden = frozenset(),
     jumped: Hidden = frozenset(),
+    held: Hidden = frozenset(),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -89,10 +90,11 @@ def explain(
         begun: Columns of parts of which another sensor is hidden already.
         jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
             not begun to lie.
+        held: The column that holds its value while all others move, if one does.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
-    singles, others = _candidates(evidence, environment, sudden, jumped)
+    singles, others = _candidates(evidence, environment, sudden, jumped, held)
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -114,7 +116,7 @@ def explain(
     single = single or [column for column in others if solves(frozenset({column}))]
     strongest = set(order[:3].tolist())
     part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest), begun)
-    for preferred in (sudden, part, beyond):
+    for preferred in (sudden, held, part, beyond):
         single = [column for column in single if column in preferred] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
@@ -122,7 +124,7 @@ def explain(
     if pair and (not jumped or pair <= jumped):
         return Cause(pair, "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if environment and not evidence.is_slow[lead]:  # another tool is there at once
-        tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden)
+        tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden | held)
         if tool is not None:
             return tool
     if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
@@ -140,7 +142,9 @@ def explain(
     return Cause(frozenset(), "body", lead)
 
 
-def _candidates(evidence: Evidence, environment: Hidden, sudden: Hidden, jumped: Hidden) -> tuple[list[int], list[int]]:
+def _candidates(
+    evidence: Evidence, environment: Hidden, sudden: Hidden, jumped: Hidden, held: Hidden
+) -> tuple[list[int], list[int]]:
     """Return the columns that are held against each other, and those that are tried if none of them explains it.
 
     Args:
@@ -148,12 +152,13 @@ def _candidates(evidence: Evidence, environment: Hidden, sudden: Hidden, jumped:
         environment: The columns of p.
         sudden: As in `explain`.
         jumped: As in `explain`.
+        held: As in `explain`.
     """
     order = [int(c) for c in np.argsort(-evidence.strength)]
     singles = [c for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and c not in environment]
-    singles += sorted(sudden - environment - set(singles))
+    singles += sorted((sudden | held) - environment - set(singles))
     if jumped:
-        return [c for c in singles if c in jumped | sudden] if len(jumped) <= TOGETHER else [], []
+        return [c for c in singles if c in (jumped | sudden | held if len(jumped) <= TOGETHER else held)], []
     least = max(PLAUSIBLE, BEHIND * evidence.highest)
     return singles, [c for c in order[CANDIDATES:] if evidence.ratio[c] >= least and c not in environment]
 

@@ -37,6 +37,10 @@ PREDICTED = 1.5
 CALM, CALM_BLOCKS = 0.3, 30
 """While its prediction moves by less than the first number of healthy errors per block, a noisy sensor changes all the
 same. It is known to be one after the second number of such blocks: while the body moves every value changes."""
+HELD, LONGER_HELD, MOST = 0.5, 2.0, 0.5
+"""An element holds its value if it repeats for the first number of blocks of motion at the usual pace, and for the
+second multiple of its longest usual one, and no other one does for longer than usual. A motion in which more than the
+third share of all elements repeat shows nothing of them: they rest."""
 
 
 def moved_alone(values: np.ndarray, error: np.ndarray, left: Hidden = frozenset()) -> Hidden:
@@ -140,12 +144,24 @@ class Repeats:
         self._last: np.ndarray | None = None
         self._predicted, self._start = np.full((2, 1), np.nan)  # of one element until their number is known
         self._run, self._moved, self._usual, self._calm = np.zeros((4, 1))
+        self._held, self._usually_held = np.zeros((2, 1))
         self._is_stuck = np.zeros(1, bool)
 
     @property
     def stuck(self) -> Hidden:
         """Numbers of the elements that are stuck."""
         return frozenset(np.flatnonzero(self._is_stuck).tolist())
+
+    @property
+    def held(self) -> Hidden:
+        """Number of the only element that holds its value while all others move; empty if none or several do.
+
+        An encoder without noise is never known to be stuck, because a joint may rest while others move. But if one of
+        some elements that explain an alarm holds its value as it never did before, it is the likeliest.
+        """
+        is_longer = self._held >= np.maximum(HELD, self._usually_held)
+        is_long = is_longer & (self._held >= LONGER_HELD * self._usually_held)
+        return frozenset(np.flatnonzero(is_long).tolist()) if is_longer.sum() == 1 else frozenset()
 
     def add(self, values: np.ndarray, motion: float, predicted: np.ndarray, error: np.ndarray) -> None:
         """Add the newest block.
@@ -163,6 +179,9 @@ class Repeats:
         self._usual = np.maximum(self._usual * (1.0 - 1.0 / MEMORY), ended)
         self._run = np.where(repeats, self._run + 1.0, 0.0)
         self._moved = np.where(repeats, self._moved + motion, 0.0)
+        ended = np.where(repeats, 0.0, self._held)
+        self._usually_held = np.maximum(self._usually_held * (1.0 - 1.0 / MEMORY), ended)
+        self._held = np.where(repeats, self._held + motion * (repeats.mean() <= MOST), 0.0)
         self._calm = self._calm + (~repeats & (np.abs(predicted - self._predicted) < CALM * error))
         self._start = np.where(repeats & np.isfinite(self._start), self._start, predicted)
         self._predicted = predicted

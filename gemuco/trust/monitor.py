@@ -427,7 +427,7 @@ class TrustMonitor:
             bench.beyond,
             (bench.sudden(age) | bench.recent.repeats.stuck | bench.moved_alone(age)) - hidden,
             begun,
-            self._jumped or frozenset(),
+            self._jumped or frozenset(), bench.recent.repeats.held - hidden,
         )  # fmt: skip
 
     def _hidden_columns(self) -> Hidden:

@@ -1,6 +1,6 @@
 """Lies of sensors to a service that learns online: who is hidden, how soon, and who is hidden of a healthy robot.
 
-    python -m studies.live.liars [--plays 12] [--first 0] [--kinds offset tool] [--still]
+    python -m studies.live.liars [--plays 12] [--first 0] [--kinds offset tool] [--still] [--some] [--ticks 4096]
 
 A PR2 with a duster in its hand moves between random postures at random speeds, and rests between them. All loops of the
 model service run at their own rates, `adapt` is on (off with `--still`), and the tool at the start is another one than
@@ -10,8 +10,9 @@ the service believes. After about half a minute one thing happens, and 25 s late
     tool, strange           another tool is in the hand at once, a trained one or one that was never trained
     none                    nothing
 
-Encoders have no noise, and the camera reports 35 ms late. The model is trained once on the designer's forecast without
-noise, and kept in runs/lies.
+Encoders have no noise, and the camera reports 35 ms late. With `--some` half of the moves are of one to three joints
+while the others rest, and `--ticks` is the number of values that an encoder has per turn. The model is trained once on
+the designer's forecast without noise, and kept in runs/lies.
 """
 
 import argparse
@@ -75,8 +76,16 @@ class Play:
     began: float = 0.0
 
 
-def motion(robot: RobotConfig, condition: str, seed: int, seconds: float) -> np.ndarray:
-    """Return joint positions [rad] every `STEP` of moves between random postures with rests, shape (n, joints)."""
+def motion(robot: RobotConfig, condition: str, seed: int, seconds: float, some: bool = False) -> np.ndarray:
+    """Return joint positions [rad] every `STEP` of moves between random postures with rests, shape (n, joints).
+
+    Args:
+        robot: The robot.
+        condition: The tool in its hand.
+        seed: Draws postures, speeds and rests.
+        seconds: Least length [s].
+        some: Whether half of the moves are of one to three joints only.
+    """
     draw, config = np.random.default_rng([seed, 9]), collect_config(robot)
     moves = random_postures(robot, config, condition, seed)(np.mean(robot.bounds(JOINTS), axis=0))
     goals = (goal for goal, hold in moves if hold == config.hold)  # every move ends with a rest
@@ -84,18 +93,40 @@ def motion(robot: RobotConfig, condition: str, seed: int, seconds: float) -> np.
     while sum(map(len, parts)) * STEP < seconds:
         rest = draw.choice([draw.uniform(0.1, 0.5), draw.uniform(1.0, 6.0)])
         parts.append(np.repeat(parts[-1][-1:], round(rest / STEP), axis=0))
-        parts.append(minimum_jerk(parts[-1][-1], next(goals), draw.uniform(0.3, 2.0), STEP))
+        goal = next(goals)
+        if some and draw.random() < 0.5:
+            resting = draw.permutation(len(goal))[draw.integers(1, 4) :]
+            goal = np.where(np.isin(np.arange(len(goal)), resting), parts[-1][-1], goal)
+        parts.append(minimum_jerk(parts[-1][-1], goal, draw.uniform(0.3, 2.0), STEP))
     return np.concatenate(parts)
 
 
-def play(robot: RobotConfig, schema: BodySchema, kind: str, seed: int, learns: bool = True) -> Play:
-    """Play once; the seed draws motion, tools, the liar, and the time."""
+def play(
+    robot: RobotConfig,
+    schema: BodySchema,
+    kind: str,
+    seed: int,
+    learns: bool = True,
+    some: bool = False,
+    ticks: int = 0,
+) -> Play:
+    """Play once; the seed draws motion, tools, the liar, and the time.
+
+    Args:
+        robot: The robot.
+        schema: Its model.
+        kind: What happens.
+        seed: The seed.
+        learns: Whether the service learns online.
+        some: Whether half of the moves are of one to three joints only.
+        ticks: Number of values that an encoder has per turn; any value by default.
+    """
     draw = np.random.default_rng([seed, 3])
     condition, believed = (str(draw.choice(list(schema.biases))) for _ in range(2))
     joint, size = int(draw.integers(robot.signals[JOINTS].size)), float(draw.choice(SIZES))
     sign, begin = float(draw.choice([-1.0, 1.0])), float(draw.uniform(EARLIEST, LATEST))
     others = [name for name in GRASPS if (name in schema.biases) == (kind == "tool") and name != condition]
-    true = motion(robot, condition, seed, begin + AFTERWARDS + 1.0)
+    true = motion(robot, condition, seed, begin + AFTERWARDS + 1.0, some)
     tip = tool_tip(GRASPS[condition], true)
     if kind in ("tool", "strange"):
         tip[round(begin / STEP) :] = tool_tip(GRASPS[str(draw.choice(others))], true[round(begin / STEP) :])
@@ -106,6 +137,8 @@ def play(robot: RobotConfig, schema: BodySchema, kind: str, seed: int, learns: b
         "frozen": np.full_like(lying, lying[0]),
         "drift": lying + sign * size * np.minimum(np.arange(len(lying)) * STEP / 2.0, 1.0),
     }.get(kind, lying)
+    if ticks:
+        shown = np.round(shown * ticks / (2.0 * np.pi)) * (2.0 * np.pi / ticks)
     is_wrong = np.abs(shown - true)[:, joint] >= WRONG
     began = float(is_wrong.argmax() * STEP - begin) if is_wrong.any() else np.nan
     service = LiveService(robot, schema.under(believed if learns else condition))
@@ -175,8 +208,11 @@ if __name__ == "__main__":
     parser.add_argument("--first", type=int, default=0, help="The first seed.")
     parser.add_argument("--kinds", nargs="+", default=[*LIES, *HEALTHY], choices=[*LIES, *HEALTHY])
     parser.add_argument("--still", action="store_true", help="Do not learn online; the service knows the tool.")
+    parser.add_argument("--some", action="store_true", help="Half of the moves are of one to three joints only.")
+    parser.add_argument("--ticks", type=int, default=0, help="Values per turn of an encoder; any value by default.")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
     robot, schema = load_robot("robots/pr2_duster.yaml"), model_of("pr2_duster")
     seeds = range(options.first, options.first + options.plays)
-    show("what happens", options.kinds, seeds, partial(play, robot, schema, learns=not options.still))
+    played = partial(play, robot, schema, learns=not options.still, some=options.some, ticks=options.ticks)
+    show("what happens", options.kinds, seeds, played)
