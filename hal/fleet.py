@@ -8,7 +8,7 @@ from hal import registry
 from hal.calibration import store
 from hal.calibration.line import Calibration
 from hal.clock import BusClock
-from hal.config import DeviceConfig, RobotConfig
+from hal.config import BusConfig, DeviceConfig, RobotConfig
 from hal.device import Device
 from hal.drivers.bus_device import Place
 from hal.errors import ConfigError
@@ -35,9 +35,7 @@ def build(
     if calibrations is None:
         calibrations = store.load(config)
     budget.check(config)
-    buses: dict[str, Wire] = {
-        name: (SerialLine if bus.interface in SERIAL else Bus)(name, bus, clock) for name, bus in config.buses.items()
-    }
+    buses = {name: _wire(name, bus, clock) for name, bus in config.buses.items()}
     devices: list[Device] = []
     for name, entry in config.devices.items():
         calibration = calibrations.get(name)
@@ -51,6 +49,16 @@ def build(
         )
         devices.append(driver(place, settings))
     return list(buses.values()), devices
+
+
+def _wire(name: str, bus: BusConfig, clock: BusClock) -> Wire:
+    if bus.interface not in SERIAL:
+        return Bus(name, bus, clock)
+    if bus.is_fd:
+        raise ConfigError(
+            f"buses.{name}.data_bitrate is for CAN FD, and '{bus.interface}' is a serial line. Remove it."
+        )
+    return SerialLine(name, bus, clock)
 
 
 def _check_wire(driver: Any, config: RobotConfig, entry: DeviceConfig, name: str) -> None:

@@ -18,6 +18,7 @@ from simulators.hub import HubServer
 from simulators.lies import LIES, SWAPPED, TRUE, known_lies, lie_of
 from simulators.nodes.canopen.segment import Segment
 from simulators.nodes.canopen.spec import NodeSpec
+from simulators.nodes.dbc.sensor import DbcNode
 from simulators.nodes.node import SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant, Snapshot
 from simulators.nodes.serial.segment import LineSegment
@@ -56,6 +57,7 @@ class Rig:
 
         Raises:
             ValueError: A node is on a bus, or measures an element, that the robot file does not have.
+            ConfigError: A bus is a serial line of hardware, or carries no frames of CAN FD, which a node sends.
         """
         _check(config, hardware)
         self._world = world
@@ -82,6 +84,12 @@ class Rig:
                 self._segments[name] = LineSegment(name, specs, self._plant, bus)
                 continue
             self._segments[name] = Segment(name, specs, self._plant, _opener(bus))
+        for name, node in self._nodes().items():
+            if isinstance(node, DbcNode) and node.is_fd and not config.buses[node.spec.bus].is_fd:
+                raise ConfigError(
+                    f"Node '{name}' sends frames of CAN FD, and bus '{node.spec.bus}' carries classic frames only. Set "
+                    f"buses.{node.spec.bus}.data_bitrate."
+                )
         self._drives = [node for node in self._nodes().values() if isinstance(node, SimulatedDrive)]
         self._threads: list[threading.Thread] = []
         self._running = threading.Event()

@@ -73,7 +73,11 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
         if is_serial and driver.state is not None:
             states.append(BITS_PER_BYTE * (2 * driver.packets.OVERHEAD + driver.state[1]))
         quantities = tuple(entry.elements) or driver.quantities(settings)[:1]
-        for frames in driver.traffic_of(settings, rate, quantities, config.folder):
+        try:
+            traffic = driver.traffic_of(settings, rate, quantities, config.folder)
+        except ConfigError as error:  # such as a DBC file that is not there
+            raise ConfigError(f"Device '{device}': {error}") from None
+        for frames in traffic:
             size, times, is_extended, is_fd = Frames(*frames)
             bits: float = BITS_PER_BYTE * size
             if not is_serial:  # a device of a serial line on a CAN bus is refused later

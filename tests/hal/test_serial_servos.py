@@ -343,6 +343,9 @@ def test_devices_on_the_wrong_wire_and_makes_on_one_line_are_refused():
     devices["lift_servo"] = {**devices["lift_servo"], "kind": "other"}
     with pytest.raises(ConfigError, match="do not understand each other"):
         build(robot_file("feetech", kinds=kinds, devices=devices), SystemClock())
+    fd = {"arm": {"interface": "pty", "channel": "/nowhere/x", "data_bitrate": 2_000_000}}
+    with pytest.raises(ConfigError, match=r"buses\.arm\.data_bitrate is for CAN FD, and 'pty' is a serial line"):
+        build(robot_file("feetech", buses=fd), SystemClock())
 
 
 def test_too_many_bytes_for_the_line_are_refused_before_it_opens():

@@ -12,6 +12,7 @@ from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.protocols.dbc import load
 from simulators.nodes.dbc.frames import Output, decoded, raw_of
+from simulators.robots.bench import simulator
 
 SENSOR = """VERSION ""
 BU_: Cell Host
@@ -274,3 +275,10 @@ def test_a_value_that_does_not_fit_is_sent_as_the_nearest_one(tmp_path: Path) ->
     assert raw_of(file.signal("Load.Flags")[1], "OVERLOAD") == 1.0
     with pytest.raises(ConfigError, match=r"has no value 'BROKEN'\. It has: FINE, OVERLOAD"):
         raw_of(file.signal("Load.Flags")[1], "BROKEN")
+
+
+def test_a_node_with_frames_of_can_fd_is_refused_on_a_classic_bus(tmp_path: Path) -> None:
+    body = servo(tmp_path, "position")
+    (tmp_path / "load_cell.dbc").write_text(SERVO.replace("Status: 8", "Status: 24"))
+    with pytest.raises(ConfigError, match=r"'axis' sends frames of CAN FD.*buses\.can0\.data_bitrate"):
+        simulator.rig(virtual(body), "bench", 0)

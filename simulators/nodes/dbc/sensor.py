@@ -84,6 +84,11 @@ class DbcNode(SimulatedNode):
             *((request, self._on_tare) for request in self._tares[-1:]),
         ]
 
+    @property
+    def is_fd(self) -> bool:
+        """Whether it sends frames of CAN FD."""
+        return any(dbc.is_fd(output.definition) for output in self._outputs.values())
+
     def _message(self, name: str) -> Output:
         if name not in self._outputs:
             definition = self._dbc.message(name)
