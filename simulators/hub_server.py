@@ -14,6 +14,7 @@ from typing import Self
 
 import can
 
+from hal.protocols.can_frames import FD_SIZES
 from simulators.hub_socket import HELLOS, IS_FD, RECORD, RECORD_FD, RECORDS, mode_of, socket_path
 from simulators.wire_time import ERROR, Wire
 
@@ -152,9 +153,7 @@ class HubServer:
                 self._drop(client)
                 return
             if len(packet) % self._record.size:
-                self._counters["malformed"] += 1
-                _log.warning("hub %s: disconnected a client that sent a packet of a wrong size", self.channel)
-                self._drop(client)
+                self._refuse(client, "a packet of a wrong size")
                 return
             self._counters["frames"] += len(packet) // self._record.size
             if self._wire is None:
@@ -170,6 +169,9 @@ class HubServer:
             if identifier & ERROR:
                 self._share(client, record)
             elif length & IS_FD:
+                if length & ~IS_FD not in FD_SIZES:
+                    self._refuse(client, "a frame of CAN FD with a length that there is not")
+                    return
                 wire.push_fd(now, client, identifier, data[: length & ~IS_FD], record)
             else:
                 wire.push(now, client, identifier, data[:length], min(length, 8), record)
@@ -197,6 +199,11 @@ class HubServer:
             self._counters["cut_off"] += 1
             _log.warning("hub %s: disconnected a client that does not read", self.channel)
             self._drop(client)
+
+    def _refuse(self, client: _Client, what: str) -> None:
+        self._counters["malformed"] += 1
+        _log.warning("hub %s: disconnected a client that sent %s", self.channel, what)
+        self._drop(client)
 
     def _drop(self, client: _Client) -> None:
         if client in self._clients:

@@ -127,6 +127,8 @@ class Traffic:
         """Add a frame."""
         if frame is None or frame.is_error or frame.is_remote:
             return
+        if not self._lengths.fits(len(frame.data), frame.is_fd):
+            return
         identifier, data = frame.identifier, frame.data
         self.counts[identifier | (EXTENDED if frame.is_extended else 0)] += 1
         self.bits += self._lengths.of(len(data), frame.is_extended, frame.is_fd)

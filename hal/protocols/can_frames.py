@@ -83,6 +83,7 @@ class FrameLengths:
     Attributes:
         classic: Lengths of classic frames with an 11-bit identifier, by data bytes.
         extended: Those with a 29-bit identifier.
+        is_fd: Whether the bus has frames of CAN FD too.
     """
 
     def __init__(self, bitrate: int, data_bitrate: int | None) -> None:
@@ -97,8 +98,12 @@ class FrameLengths:
             for is_extended in (False, True)
         }
 
+    def fits(self, size: int, is_fd: bool) -> bool:
+        """Whether the bus has frames with `size` data bytes, of CAN FD or classic ones."""
+        return self.is_fd and size in FD_SIZES if is_fd else size <= LONGEST
+
     def of(self, size: int, is_extended: bool, is_fd: bool) -> float:
-        """Return the length of a frame with `size` data bytes, of CAN FD one of `FD_SIZES`."""
+        """Return the length of a frame that `fits`."""
         return self._fd[size, is_extended] if is_fd else (self.extended if is_extended else self.classic)[size]
 
 

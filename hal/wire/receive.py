@@ -76,7 +76,7 @@ class Receiver:
         data = message.data
         size = len(data)
         lengths = self._lengths
-        if message.is_remote_frame or (not lengths.is_fd if message.is_fd else size > LONGEST):
+        if message.is_remote_frame or not lengths.fits(size, message.is_fd):
             counters["ignored"] += 1
             return
         identifier = message.arbitration_id

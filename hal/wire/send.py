@@ -121,7 +121,7 @@ class Sender:
     def _fits(self, message: can.Message) -> bool:
         """Return whether the bus has such frames; if not, it is counted, and the reason is passed on."""
         size = len(message.data)
-        if size in FD_SIZES and self._lengths.is_fd if message.is_fd else size <= LONGEST:
+        if self._lengths.fits(size, message.is_fd):
             return True
         self._counters["send_failures"] += 1
         text = f"Frame {message.arbitration_id:03X}h has {size} data bytes; "

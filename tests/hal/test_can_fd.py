@@ -13,6 +13,8 @@ from hal.drivers.can_device import Place
 from hal.drivers.dbc.sensor import DbcNode
 from hal.drivers.dbc.settings import DbcSettings
 from hal.errors import ConfigError
+from hal.finding.scan import scan
+from hal.finding.tap import Tap
 from hal.protocols import dbc
 from hal.protocols.can_frames import FD_SIZES, FrameLengths, fd_bits, fd_size, frame_bits
 from hal.wire import budget
@@ -164,6 +166,23 @@ def test_a_classic_bus_ignores_frames_of_can_fd_and_sends_none(tmp_path):
         until(lambda: bus.counters["ignored"] == 1, "the ignored frame")
         assert not bus.send(wide(5))
         assert bus.counters["send_failures"] == 1 and bus.state is not BusState.BUS_OFF
+        bus.close()
+
+
+def test_a_length_that_there_is_not_is_ignored_and_stops_nothing(tmp_path):
+    """An interface may pass on anything, and its thread must go on."""
+    config = BusConfig(interface="virtual", channel=f"odd {tmp_path}", data_bitrate=5_000_000)
+    bus, heard = Bus("can0", config, SystemClock()), []
+    bus.subscribe(256, lambda data, received: heard.append(len(data)))
+    with can.Bus(interface="virtual", channel=config.channel) as peer, Tap("can0", config) as tap:
+        bus.open()
+        for size in (9, 65):
+            peer.send(can.Message(arbitration_id=256, data=bytes(size), is_fd=True, is_extended_id=False))
+        peer.send(wide(5))
+        until(lambda: heard, "the sound frame")
+        assert heard == [32]
+        assert (bus.counters["ignored"], bus.counters["opened"], bus.counters["failures"]) == (2, 1, 0)
+        assert scan(tap, listen=0.1, ask=False).unknown == {256: pytest.approx(10.0)}
         bus.close()
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from simulators import hub_server
 from simulators.hub import HubBus, HubServer
-from simulators.hub_socket import RECORD, channels, socket_path
+from simulators.hub_socket import IS_FD, RECORD, RECORD_FD, channels, socket_path
 
 
 @pytest.fixture
@@ -185,6 +185,19 @@ def test_a_client_that_speaks_another_language_is_dropped(channel):
         stranger.send(b"GET / HTTP/1.1")
         wait_until(lambda: server.stats()["malformed"] == 1)
         assert server.stats()["clients"] == 0
+
+
+def test_a_client_with_a_frame_of_can_fd_of_a_length_that_there_is_not_is_dropped(channel):
+    with (
+        HubServer(channel, 1_000_000, 4_000_000) as server,
+        HubBus(channel) as bus,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger,
+    ):
+        stranger.connect(channel)
+        stranger.send(RECORD_FD.pack(0x123, 9 | IS_FD, 0.0, bytes(9)))
+        wait_until(lambda: server.stats()["malformed"] == 1)
+        bus.send(can.Message(arbitration_id=0x123, data=bytes(12), is_fd=True, is_extended_id=False))
+        wait_until(lambda: server.stats()["clients"] == 1 and server.stats()["frames"] == 2)
 
 
 def test_a_program_that_leaves_is_forgotten(channel):

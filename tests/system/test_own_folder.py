@@ -22,7 +22,7 @@ from services.process.lock import ServiceLock
 from services.runtime import runtime_folder
 from simulators.hub import HubBus
 from simulators.hub_server import HubServer
-from simulators.hub_socket import BUSES, HELLO, socket_path
+from simulators.hub_socket import BUSES, HELLOS, socket_path
 
 STRANGER = 65534
 """`nobody` is the other user."""
@@ -148,7 +148,7 @@ def test_a_bus_of_another_user_is_not_joined(shared: Path, monkeypatch: pytest.M
         listener.listen()
         os.write(writer, b"x")
         listener.accept()  # refused
-        listener.accept()[0].send(HELLO)
+        listener.accept()[0].send(next(iter(HELLOS)))
 
     pid = begin_as_stranger(serve)
     os.read(reader, 1)
