@@ -23,7 +23,7 @@ class Frames(NamedTuple):
     """Frames that a device sends or receives.
 
     Attributes:
-        size: Data bytes; on a serial line all bytes of a packet but its frame.
+        size: Data bytes; on a serial line its bytes.
         rate: Frames per second [Hz].
         is_extended: Whether the identifier has 29 bits.
         is_fd: Whether they are frames of CAN FD.
@@ -65,18 +65,6 @@ def fd_bits(size: int, is_extended: bool = False) -> tuple[int, int]:
     return head + in_head + TAIL, middle + (head + middle - 1) // 4 - in_head + checksum_bits(size)
 
 
-def fd_frame_bits(size: int, is_extended: bool, share: float) -> float:
-    """Return the longest length of a frame of CAN FD, in bits at the bit rate of the bus.
-
-    Args:
-        size: Data bytes.
-        is_extended: Whether the identifier has 29 bits.
-        share: Bit rate of the bus as a share of that of the data.
-    """
-    at_bus, at_data = fd_bits(size, is_extended)
-    return at_bus + share * at_data
-
-
 class FrameLengths:
     """Longest lengths of all frames of one bus, in bits at its bit rate.
 
@@ -93,9 +81,10 @@ class FrameLengths:
         self.is_fd = data_bitrate is not None
         share = bitrate / (data_bitrate or bitrate)
         self._fd = {
-            (size, is_extended): fd_frame_bits(size, is_extended, share)
+            (size, is_extended): at_bus + share * at_data
             for size in FD_SIZES
             for is_extended in (False, True)
+            for at_bus, at_data in [fd_bits(size, is_extended)]
         }
 
     def fits(self, size: int, is_fd: bool) -> bool:

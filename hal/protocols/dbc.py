@@ -40,13 +40,15 @@ class Dbc:
     Attributes:
         path: The file.
         messages: Its messages.
-        left_out: Name of a message that cannot be used -> why: it is longer than a frame of CAN FD, or its signals
-            overlap or do not fit.
+        left_out: Name of a message that cannot be used -> why: it is longer than a frame, or its signals overlap or do
+            not fit.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
-        self.left_out = {message.name: wrong for message in database.messages if (wrong := _fault_of(message))}
+        self.left_out = {
+            message.name: wrong for message in database.messages if (wrong := _fault_of(message, database))
+        }
         self.messages = tuple(message for message in database.messages if message.name not in self.left_out)
         self._messages = {message.name: message for message in self.messages}
 
@@ -130,8 +132,16 @@ def load(path: Path) -> Dbc:
     return Dbc(path, database)
 
 
-def _fault_of(message: Message) -> str:
+def _fault_of(message: Message, database: Database) -> str:
     """Return why a message cannot be used; empty if it can."""
+    if message.length > LONGEST and not message.is_fd:
+        size, specifics = f"It has {message.length} bytes", database.dbc
+        attributes = specifics.attributes if specifics is not None else {}
+        protocol = attributes["ProtocolType"].value if "ProtocolType" in attributes else message.protocol
+        if str(protocol).upper() == "J1939":
+            return f"{size}, so it comes in several frames by the transport protocol of J1939, which is not supported."
+        if specifics is not None and "VFrameFormat" in specifics.attribute_definitions:
+            return f"{size}, and a frame that is not of CAN FD by its VFrameFormat has at most {LONGEST}."
     if message.length > LONGEST_FD:
         return f"It has {message.length} bytes; a frame of CAN FD has at most {LONGEST_FD}."
     try:
@@ -142,7 +152,7 @@ def _fault_of(message: Message) -> str:
 
 
 def is_fd(message: Message) -> bool:
-    """Whether the frames of a message are of CAN FD: by its attribute VFrameFormat, or by its length."""
+    """Whether the frames of a usable message are of CAN FD: by VFrameFormat, or without that by its length."""
     return bool(message.is_fd) or message.length > LONGEST
 
 

@@ -41,7 +41,10 @@ BO_ 2566848513 TooLong: 65 Node
  SG_ Value : 0|32@1- (1,0) [0|0] "" Host
 {FORMATS}
 BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "VFrameFormat" BO_ 256 14;
 BA_ "VFrameFormat" BO_ 257 14;
+BA_ "VFrameFormat" BO_ 512 14;
+BA_ "VFrameFormat" BO_ 2566848513 15;
 """
 SENSOR = {
     "dbc": "wide.dbc",
@@ -79,6 +82,38 @@ def test_what_a_dbc_file_says_of_its_frames(file):
     kinds = {message.name: (dbc.is_fd(message), dbc.size_of(message)) for message in file.messages}
     assert kinds == {"Wide": (True, 32), "Short": (True, 4), "Plain": (False, 8), "Order": (True, 12)}
     assert "at most 64" in file.left_out["TooLong"]
+
+
+LONG = """VERSION ""
+BU_: Ecu
+BO_ 2364540158 Long: 39 Ecu
+ SG_ Speed : 0|16@1+ (0.125,0) [0|8000] "rpm" Vector__XXX
+BO_ 2364540159 Brief: 8 Ecu
+ SG_ Speed : 0|16@1+ (0.125,0) [0|8000] "rpm" Vector__XXX
+"""
+OLD_FORMATS = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+
+
+@pytest.mark.parametrize(
+    ("attributes", "reason"),
+    [
+        ("", ""),
+        (f'{OLD_FORMATS}BA_DEF_DEF_ "VFrameFormat" "J1939PG";\n', "transport protocol of J1939"),
+        (
+            'BA_DEF_ "ProtocolType" STRING ;\nBA_DEF_DEF_ "ProtocolType" "";\nBA_ "ProtocolType" "J1939";\n',
+            "transport protocol of J1939",
+        ),
+        (f'{OLD_FORMATS}BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";\n', "not of CAN FD by its VFrameFormat"),
+    ],
+)
+def test_a_long_message_is_one_of_can_fd_only_if_the_file_does_not_say_otherwise(tmp_path, attributes, reason):
+    """A message of J1939 with more than 8 bytes comes in several classic frames."""
+    (tmp_path / "long.dbc").write_text(LONG + attributes)
+    file = dbc.load(tmp_path / "long.dbc")
+    assert reason in file.left_out.get("Long", "")
+    assert {message.name: dbc.is_fd(message) for message in file.messages} == (
+        {"Brief": False} if reason else {"Long": True, "Brief": False}
+    )
 
 
 @pytest.mark.parametrize("names", [("High",), ("High", "Odd"), ("Low", "High", "Odd")])
