@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -58,19 +59,44 @@ class Cause:
         return self.cause in ("element", "either")
 
 
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """Signs of a lie besides that columns contradict each other.
+
+    Attributes:
+        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
+        jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
+            not begun to lie.
+        held: The column that holds its value while all others move, if one does.
+        alone: The column that moved while all others rested, if one did. If one of these is its twin, that may be
+            frozen as well.
+        beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
+            alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
+        begun: Columns of parts of which another sensor is hidden already.
+    """
+
+    sudden: Hidden = frozenset()
+    jumped: Hidden = frozenset()
+    held: Hidden = frozenset()
+    alone: Hidden = frozenset()
+    beyond: Hidden = frozenset()
+    begun: Hidden = frozenset()
+
+
+NONE = Signs()
+"""Nothing else is known of any column."""
+
+
 def explain(
     evidence: Evidence,
     without: Callable[[Hidden], Evidence],
     devices: Sequence[Hidden],
     parts: Sequence[Hidden],
     environment: Hidden,
+    signs: Signs = NONE,
     conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]] = lambda: (),
     exchanges: Iterable[tuple[Hidden, Evidence]] = (),
-    beyond: Hidden = frozenset(),
-    sudden: Hidden = frozenset(),
-    begun: Hidden = frozenset(),
-    jumped: Hidden = frozenset(),
-    held: Hidden = frozenset(),
+    are_twins: Callable[[int, int], bool] = lambda first, second: False,
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -80,21 +106,15 @@ def explain(
         devices: Columns that one device measures.
         parts: Columns that belong to one part of the body, such as a muscle, which may itself have changed.
         environment: The columns of p.
+        signs: What else is known of the columns.
         conditions: Returns each other trained condition, the evidence under its p, and whether the healthy errors
             under it are known; if not, a doubt is in favour of the sensors.
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
-        beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
-            alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
-        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck, or that
-            moved while all others rested.
-        begun: Columns of parts of which another sensor is hidden already.
-        jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
-            not begun to lie.
-        held: The column that holds its value while all others move, if one does.
+        are_twins: Returns whether hardly anything but each other predicts two columns.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
-    singles, others = _candidates(evidence, environment, sudden, jumped, held)
+    singles, others = _candidates(evidence, environment, signs)
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -109,22 +129,25 @@ def explain(
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""
         for column in order[:SEARCHED].tolist():
-            if column not in environment and not jumped:
+            if column not in environment and not signs.jumped and not solves(frozenset({column})):
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
     single = single or [column for column in others if solves(frozenset({column}))]
-    strongest = set(order[:3].tolist())
-    part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest), begun)
-    for preferred in (sudden, held, part, beyond):
+    twins = partial(_twins, without, are_twins)
+    sudden = signs.sudden | frozenset(column for column in signs.alone if not twins(column, single))
+    accused = (part for part in parts if part.intersection(order[:3].tolist()))
+    part = _changed_part(evidence, without, left, single, accused, signs.begun)
+    for preferred in (sudden, signs.held, part):
         single = [column for column in single if column in preferred] or single
-    best = float(evidence.strength[single[0]]) if single else 0.0
+    possible = single
+    single = [column for column in single if column in signs.beyond] or single
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)
-    if pair and (not jumped or pair <= jumped):
+    if pair and (not signs.jumped or pair <= signs.jumped):
         return Cause(pair, "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if environment and not evidence.is_slow[lead]:  # another tool is there at once
-        tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden | held)
+        tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden | signs.held)
         if tool is not None:
             return tool
     if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
@@ -132,33 +155,31 @@ def explain(
     if part and not (part | sudden).intersection(single):
         return Cause(part, "part", max(part, key=lambda c: evidence.strength[c]))
     if single:
-        alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
-        if len(alike) == 1:
-            return Cause(frozenset(alike), "element", alike[0])
-        return Cause(frozenset(alike[:MOST]), "either", alike[0])
-    for columns, cause in _sets(singles, devices, parts, partners, jumped):
+        alike = [c for c in single if _is_alike(*evidence.strength[[single[0], c]].tolist())]
+        alike = list(dict.fromkeys([*alike, *twins(alike[0], possible)]))[:MOST]
+        return Cause(frozenset(alike), "element" if len(alike) == 1 else "either", alike[0])
+    for columns, cause in _sets(singles, devices, parts, partners, signs.jumped):
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
 
 
-def _candidates(
-    evidence: Evidence, environment: Hidden, sudden: Hidden, jumped: Hidden, held: Hidden
-) -> tuple[list[int], list[int]]:
-    """Return the columns that are held against each other, and those that are tried if none of them explains it.
+def _twins(
+    without: Callable[[Hidden], Evidence], are_twins: Callable[[int, int], bool], first: int, columns: Iterable[int]
+) -> list[int]:
+    """Return the twins of a column that is hardly contradicted without them, nor are they without it."""
+    pairs = [(c, ((first, c), (c, first))) for c in columns if c != first and are_twins(first, c)]
+    return [c for c, ways in pairs if all(float(without(frozenset({a})).strength[b]) < ALIKE for a, b in ways)]
 
-    Args:
-        evidence: The evidence.
-        environment: The columns of p.
-        sudden: As in `explain`.
-        jumped: As in `explain`.
-        held: As in `explain`.
-    """
+
+def _candidates(evidence: Evidence, environment: Hidden, signs: Signs) -> tuple[list[int], list[int]]:
+    """Return the columns that are held against each other, and those that are tried if none of them explains it."""
+    plain, jumped = signs.sudden | signs.alone | signs.held, signs.jumped
     order = [int(c) for c in np.argsort(-evidence.strength)]
     singles = [c for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and c not in environment]
-    singles += sorted((sudden | held) - environment - set(singles))
+    singles += sorted(plain - environment - set(singles))
     if jumped:
-        return [c for c in singles if c in (jumped | sudden | held if len(jumped) <= TOGETHER else held)], []
+        return [c for c in singles if c in (jumped | plain if len(jumped) <= TOGETHER else signs.held)], []
     least = max(PLAUSIBLE, BEHIND * evidence.highest)
     return singles, [c for c in order[CANDIDATES:] if evidence.ratio[c] >= least and c not in environment]
 
@@ -196,7 +217,7 @@ def _another_tool(
         conditions: As in `explain`.
         single: Columns that explain the alarm alone, the most likely first.
         rest: Smallest evidence that is left without one of them.
-        sudden: As in `explain`.
+        sudden: Columns that gave themselves away.
     """
     lead = int(evidence.strength.argmax())
     if not evidence.is_noise[lead]:

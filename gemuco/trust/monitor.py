@@ -12,7 +12,7 @@ from gemuco.trust.cases import Case, LastSearch, describe, has_agreed, has_moved
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import RIVALS, Cause, explain, remaining
+from gemuco.trust.hypotheses import RIVALS, Cause, Signs, explain, remaining
 from gemuco.trust.jumps import TOGETHER
 from gemuco.trust.relations import Relations
 from gemuco.trust.tool import JudgedTool
@@ -408,26 +408,26 @@ class TrustMonitor:
             bench.healthy.excuse(sorted(case.cause.columns), case.steps, case.is_hidden)
 
     def _describe(self, case: Case, hidden: Hidden, is_noise: bool = False) -> None:
-        """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
-        bench = self._bench
-        view, scale = bench.shown(hidden | case.cause.columns), bench.judge.scale
-        is_noise |= case.kind == "noise" or bench.recent.jumps.is_restless(case.cause.columns, view.healthy[-1] * scale)
+        """Find kind and size of a lie from its blocks so far; of some that look alike the first one lies."""
+        bench, columns = self._bench, case.cause.columns
+        lying = frozenset({case.cause.lead}) if case.cause.cause == "either" else columns
+        view, scale = bench.shown(hidden - columns | lying), bench.judge.scale
+        is_noise |= case.kind == "noise" or bench.recent.jumps.is_restless(columns, view.healthy[-1] * scale)
         describe(case, view, bench.recent, bench.relations, bench.schema, scale, self._count, is_noise)
 
     def _explain(self, evidence: Evidence, hidden: Hidden, is_new: bool = True) -> Cause:
         """Return the most likely cause of an alarm; of one that is not new, without other tools and exchanges."""
-        bench = self._bench
-        age = evidence.newest
+        bench, age = self._bench, evidence.newest
         parts, begun = remaining(self._parts, hidden, self._hidden_by_cases() & hidden)
+        signs = Signs(
+            (bench.sudden(age) | bench.recent.repeats.stuck) - hidden, self._jumped or frozenset(),
+            bench.recent.repeats.held - hidden, bench.moved_alone(age) - hidden, bench.beyond, begun,
+        )  # fmt: skip
         return explain(
             evidence, bench.without(hidden, age), self._joined, parts,
-            bench.environment - hidden if is_new else frozenset(),
-            lambda: bench.conditions(hidden, age),
+            bench.environment - hidden if is_new else frozenset(), signs, lambda: bench.conditions(hidden, age),
             bench.alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
-            bench.beyond,
-            (bench.sudden(age) | bench.recent.repeats.stuck | bench.moved_alone(age)) - hidden,
-            begun,
-            self._jumped or frozenset(), bench.recent.repeats.held - hidden,
+            lambda first, second: bench.relations.are_twins(first, second, hidden),
         )  # fmt: skip
 
     def _hidden_columns(self) -> Hidden:

@@ -27,6 +27,8 @@ NEARBY = 0.05
 """The network's errors are computed anew if a hidden element is off by more than this [standard deviations]."""
 KEPT = 64
 """At most this number of relations is kept."""
+TWIN = 6.0
+"""Two elements are twins if the healthy error of each is this multiple, or more, without the other."""
 FLOOR = 0.002
 """A healthy error is at least this share of the spread of its column in the known samples."""
 HARDLY = 0.1
@@ -50,6 +52,7 @@ class Relation:
         calibration: Healthy errors of the lies that these suggest, in their own standard deviations, shape (columns,).
         by_watch: Size of the watch's healthy errors at each sample.
         by_network: Size of the healthy errors of these lies.
+        usual: Median size of the healthy errors, of whichever is known better, shape (columns,).
     """
 
     maps: np.ndarray
@@ -63,6 +66,7 @@ class Relation:
     calibration: np.ndarray
     by_watch: LocalSize
     by_network: LocalSize
+    usual: np.ndarray
 
     def errors(self, features: np.ndarray) -> np.ndarray:
         """Return measured minus predicted [standard deviations], shape (n, columns).
@@ -185,6 +189,12 @@ class Relations:
         self._kept[hidden] = known
         return known
 
+    def are_twins(self, first: int, second: int, hidden: Hidden) -> bool:
+        """Whether hardly anything but each other predicts two columns, so the others cannot say which of them lies."""
+        usual = self.without(hidden).usual
+        pair = ((first, second), (second, first))
+        return all(self.without(hidden | {gone}).usual[left] >= TWIN * usual[left] for gone, left in pair)
+
     def _relation(self, hidden: Hidden) -> Relation:
         inputs, away = len(self.columns), np.zeros(len(self.columns), bool)
         away[list(hidden)] = True
@@ -207,7 +217,7 @@ class Relations:
         removal = np.array([_removal(spread, own, outside) for own in places])
         zero, one = np.zeros(inputs), np.ones(inputs)
         even = LocalSize.even(inputs)
-        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one, even, even)
+        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one, even, even, one)
         far = draft.far(self._rows)
         draft = replace(draft, distance=np.maximum(far.mean(axis=0), 1e-9))
         growth, errors = draft.growth(far), draft.errors(self._rows)
@@ -219,14 +229,16 @@ class Relations:
         by_network = LocalSize.fit(self._grid, ratio / calibration, hidden, self._sizes[1])
         values = self._known[:, self.columns]
         sizes = growth * std * by_watch(values), spread * calibration * by_network(values)
+        medians = np.median(sizes, axis=1)
         return replace(
             draft,
             mean=mean,
             std=std,
-            network=np.median(sizes[1], axis=0) < np.median(sizes[0], axis=0),
+            network=medians[1] < medians[0],
             calibration=calibration,
             by_watch=by_watch,
             by_network=by_network,
+            usual=medians.min(axis=0),
         )
 
     def _by_network(self, hidden: Hidden, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

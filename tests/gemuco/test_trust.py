@@ -16,7 +16,7 @@ from gemuco.trust.cases import Case
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, TrustConfig
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import Cause, explain
+from gemuco.trust.hypotheses import Cause, Signs, explain
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensitivity
@@ -319,7 +319,7 @@ def test_what_is_outside_of_the_learned_range_contradicts_no_other(beyond, accus
     def without(columns):
         return whole if columns.isdisjoint({JOINT, TENSION}) else replace(whole, ratio=0.3 * ratio)
 
-    cause = explain(whole, without, (), (), frozenset(), beyond=frozenset(beyond))
+    cause = explain(whole, without, (), (), frozenset(), Signs(beyond=frozenset(beyond)))
     assert (cause.cause, cause.columns) == ("element", frozenset({accused}))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import explain
+from gemuco.trust.hypotheses import Signs, explain
 from gemuco.trust.jumps import HELD, LONGER_HELD, Repeats
 
 SAMPLES, SIZE = 5, 5
@@ -85,9 +85,11 @@ def test_of_those_that_explain_an_alarm_the_held_one_is_wrong(jumped: tuple[int,
     def without(columns: frozenset[int]) -> Evidence:
         return replace(whole, ratio=0.1 * whole.ratio)
 
-    cause = explain(whole, without, (), (), frozenset({TOOL}), jumped=frozenset(jumped), held=frozenset({FROZEN}))
+    cause = explain(
+        whole, without, (), (), frozenset({TOOL}), Signs(jumped=frozenset(jumped), held=frozenset({FROZEN}))
+    )
     assert (cause.cause, cause.columns) == ("element", {FROZEN})
-    assert explain(whole, without, (), (), frozenset({TOOL}), jumped=frozenset(jumped)).columns != {FROZEN}
+    assert explain(whole, without, (), (), frozenset({TOOL}), Signs(jumped=frozenset(jumped))).columns != {FROZEN}
 
 
 def test_a_held_one_that_does_not_explain_the_alarm_is_not_blamed() -> None:
@@ -96,7 +98,7 @@ def test_a_held_one_that_does_not_explain_the_alarm_is_not_blamed() -> None:
     def without(columns: frozenset[int]) -> Evidence:
         return replace(whole, ratio=(0.1 if RIGHT in columns else 1.0) * whole.ratio)
 
-    assert explain(whole, without, (), (), frozenset(), held=frozenset({FROZEN})).columns == {RIGHT}
+    assert explain(whole, without, (), (), frozenset(), Signs(held=frozenset({FROZEN}))).columns == {RIGHT}
 
 
 def test_a_trained_tool_is_believed_if_it_explains_the_alarm_better_than_the_held_one() -> None:
@@ -106,5 +108,5 @@ def test_a_trained_tool_is_believed_if_it_explains_the_alarm_better_than_the_hel
         return replace(whole, ratio=0.15 * whole.ratio)
 
     calm = replace(whole, ratio=0.01 * whole.ratio, level=0.5)
-    cause = explain(whole, without, (), (), tool, lambda: [("long", calm, True)], held=frozenset({FROZEN}))
+    cause = explain(whole, without, (), (), tool, Signs(held=frozenset({FROZEN})), lambda: [("long", calm, True)])
     assert (cause.cause, cause.condition) == ("environment", "long")

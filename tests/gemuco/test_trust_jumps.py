@@ -8,7 +8,7 @@ import pytest
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.healthy import DOUBTED, PRIOR, Healthy
-from gemuco.trust.hypotheses import explain
+from gemuco.trust.hypotheses import Signs, explain
 from gemuco.trust.jumps import EARLIER, KNOWN, Jumps
 from gemuco.trust.recent import View
 
@@ -116,7 +116,7 @@ def test_of_those_that_explain_an_alarm_the_one_that_jumped_is_wrong(sudden: tup
     def without(columns: frozenset[int]) -> Evidence:
         return whole if columns <= {TIP} else replace(whole, ratio=0.1 * whole.ratio)
 
-    cause = explain(whole, without, (), (), frozenset(), sudden=frozenset(sudden))
+    cause = explain(whole, without, (), (), frozenset(), Signs(frozenset(sudden)))
     assert (cause.cause, cause.columns) == ("element", {accused})
 
 
@@ -126,14 +126,14 @@ def test_two_that_jumped_are_both_wrong_unless_a_part_of_the_body_or_another_too
     def without(columns: frozenset[int]) -> Evidence:
         return replace(whole, ratio=0.1 * whole.ratio)
 
-    cause = explain(whole, without, (), (), frozenset(), sudden=both)
+    cause = explain(whole, without, (), (), frozenset(), Signs(both))
     assert (cause.cause, cause.columns, cause.is_exchange) == ("all", both, False)
-    assert explain(whole, without, (), (both,), frozenset(), sudden=both).columns == {JOINT}
+    assert explain(whole, without, (), (both,), frozenset(), Signs(both)).columns == {JOINT}
     calm = replace(whole, ratio=0.01 * whole.ratio, level=0.5)
-    other = explain(whole, without, (), (), tool, lambda: [("long", calm, True)], sudden=both)
+    other = explain(whole, without, (), (), tool, Signs(both), lambda: [("long", calm, True)])
     assert (other.cause, other.condition) == ("environment", "long")
     exchanged = explain(
-        whole, without, (), (), frozenset(), exchanges=[(both, replace(calm, ratio=whole.ratio * 0.15))], sudden=both
+        whole, without, (), (), frozenset(), Signs(both), exchanges=[(both, replace(calm, ratio=whole.ratio * 0.15))]
     )
     assert exchanged.is_exchange, "also if one of them alone explains it better"
 

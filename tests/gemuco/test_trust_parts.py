@@ -7,7 +7,7 @@ import pytest
 
 from gemuco.trust.cases import Case
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import Cause, explain, remaining
+from gemuco.trust.hypotheses import Cause, Signs, explain, remaining
 
 SIZE, JOINT, TENSION, LENGTH, OTHER = 12, 0, 3, 8, 9
 MUSCLE = frozenset({TENSION, LENGTH})
@@ -41,7 +41,7 @@ def test_a_part_has_changed_if_it_explains_an_alarm_better_than_a_joint(
         share = rest if hidden >= MUSCLE else 0.5 if JOINT in hidden else 0.9
         return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
 
-    result = explain(whole, without, (), (MUSCLE,), frozenset(), sudden=sudden)
+    result = explain(whole, without, (), (MUSCLE,), frozenset(), Signs(sudden))
     assert (result.cause, result.columns) == (cause, columns)
 
 
@@ -133,7 +133,7 @@ def test_the_other_sensor_of_a_part_that_has_begun_to_lie_needs_to_explain_it_ne
         share = 0.5 if JOINT in hidden else rest if LENGTH in hidden else 1.0
         return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
 
-    result = explain(whole, without, (), (length,), frozenset(), begun=length if begun else frozenset())
+    result = explain(whole, without, (), (length,), frozenset(), Signs(begun=length if begun else frozenset()))
     assert result.columns == (length if is_length else {JOINT})
 
 

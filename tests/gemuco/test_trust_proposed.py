@@ -9,7 +9,7 @@ from test_trust_tools import CHANGE, LAYOUT, SAMPLES, TOOLS, body, model, walk
 
 from gemuco.trust.config import BLOCK
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.hypotheses import explain
+from gemuco.trust.hypotheses import Signs, explain
 from gemuco.trust.jumps import moved_alone
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.tool import JudgedTool
@@ -95,9 +95,9 @@ def test_what_did_not_jump_when_others_did_has_not_begun_to_lie() -> None:
     alarm, right = evidence(JOINT, TIP), lambda hidden: evidence() if JOINT in hidden else alarm
     blamed = explain(alarm, right, (), (), frozenset())
     assert blamed.columns == {JOINT}
-    spared = explain(alarm, right, (), (), frozenset(), jumped=frozenset({TIP}))
+    spared = explain(alarm, right, (), (), frozenset(), Signs(jumped=frozenset({TIP})))
     assert spared.cause == "body", "it explains the alarm, but the tip has jumped"
-    assert explain(alarm, right, (), (), frozenset(), jumped=frozenset({JOINT})).columns == {JOINT}
+    assert explain(alarm, right, (), (), frozenset(), Signs(jumped=frozenset({JOINT}))).columns == {JOINT}
 
 
 def test_a_device_whose_values_all_jump_is_the_cause_and_no_one_of_them() -> None:
@@ -106,9 +106,9 @@ def test_a_device_whose_values_all_jump_is_the_cause_and_no_one_of_them() -> Non
     def right(hidden: frozenset[int]) -> Evidence:
         return evidence() if JOINT in hidden else alarm
 
-    cause = explain(alarm, right, (jumped,), (), frozenset(), jumped=jumped)
+    cause = explain(alarm, right, (jumped,), (), frozenset(), Signs(jumped=jumped))
     assert (cause.cause, cause.columns) == ("all", jumped)
-    assert explain(alarm, right, (frozenset({JOINT, LOAD}),), (), frozenset(), jumped=jumped).cause == "body"
+    assert explain(alarm, right, (frozenset({JOINT, LOAD}),), (), frozenset(), Signs(jumped=jumped)).cause == "body"
 
 
 def test_the_only_one_that_moves_while_all_others_rest_is_named() -> None:
