@@ -13,7 +13,8 @@ from gemuco.trust.jumps import TOGETHER
 
 TOOL, EXPLAINED = 0.85, 0.6
 """Without the wrong columns the evidence against all others is below the second share of an alarm; a contact of the
-body changes what is measured by many sensors, and more is left of it. Another tool is believed below the first."""
+body changes what is measured by many sensors, and more is left of it. Another tool, and what gave itself away, is
+believed below the first."""
 CANDIDATES = 5
 """This many columns with the most evidence are held against each other."""
 BEHIND = 0.5
@@ -124,7 +125,7 @@ def explain(
         return known[columns]
 
     def solves(columns: Hidden) -> bool:
-        return left(columns) < EXPLAINED
+        return left(columns) < (TOOL if columns <= signs.sudden | signs.alone else EXPLAINED)
 
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""

@@ -138,6 +138,30 @@ def test_two_that_jumped_are_both_wrong_unless_a_part_of_the_body_or_another_too
     assert exchanged.is_exchange, "also if one of them alone explains it better"
 
 
+@pytest.mark.parametrize(
+    ("left", "signs", "cause"),
+    [
+        (0.7, Signs(frozenset({JOINT})), "element"),
+        (0.7, Signs(alone=frozenset({JOINT})), "element"),
+        (0.7, Signs(), "environment"),
+        (0.7, Signs(frozenset({MOTOR})), "environment"),
+        (0.9, Signs(frozenset({JOINT})), "environment"),
+    ],
+)
+def test_no_other_tool_is_believed_if_what_gave_itself_away_explains_as_much(
+    left: float, signs: Signs, cause: str
+) -> None:
+    """A gross lie of an encoder leaves more than a small one, and a p can be found that explains it at this posture."""
+    whole, tool = evidence(JOINT, LOAD), frozenset({LOAD})
+
+    def without(columns: frozenset[int]) -> Evidence:
+        share = left if JOINT in columns else 0.7 if LOAD in columns else np.inf
+        return replace(whole, ratio=np.minimum(whole.ratio, share))
+
+    result = explain(whole, without, (), (), tool, signs)
+    assert (result.cause, result.columns) == (cause, {JOINT} if cause == "element" else tool)
+
+
 def test_errors_that_were_large_before_a_change_are_usual() -> None:
     random, none = np.random.default_rng(2), np.full(SIZE, np.nan)
     z = random.normal(0.0, 1.0, (LONGEST, SIZE))
