@@ -13,7 +13,7 @@ from gemuco.trust.jumps import TOGETHER
 
 TOOL, EXPLAINED = 0.85, 0.6
 """Without the wrong columns the evidence against all others is below the second share of an alarm; a contact of the
-body changes what is measured by many sensors, and more is left of it. Another tool, and what gave itself away, is
+body changes what is measured by many sensors, and more is left of it. Another tool, and what jumped or is stuck, is
 believed below the first."""
 CANDIDATES = 5
 """This many columns with the most evidence are held against each other."""
@@ -62,7 +62,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """Signs of a lie besides that columns contradict each other.
+    """Signs of a lie other than a contradiction.
 
     Attributes:
         sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
@@ -125,7 +125,7 @@ def explain(
         return known[columns]
 
     def solves(columns: Hidden) -> bool:
-        return left(columns) < (TOOL if columns <= signs.sudden | signs.alone else EXPLAINED)
+        return left(columns) < (TOOL if columns <= signs.sudden else EXPLAINED)
 
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""

@@ -142,15 +142,13 @@ def test_two_that_jumped_are_both_wrong_unless_a_part_of_the_body_or_another_too
     ("left", "signs", "cause"),
     [
         (0.7, Signs(frozenset({JOINT})), "element"),
-        (0.7, Signs(alone=frozenset({JOINT})), "element"),
+        (0.7, Signs(alone=frozenset({JOINT})), "environment"),
         (0.7, Signs(), "environment"),
         (0.7, Signs(frozenset({MOTOR})), "environment"),
         (0.9, Signs(frozenset({JOINT})), "environment"),
     ],
 )
-def test_no_other_tool_is_believed_if_what_gave_itself_away_explains_as_much(
-    left: float, signs: Signs, cause: str
-) -> None:
+def test_no_other_tool_is_believed_if_what_jumped_explains_as_much(left: float, signs: Signs, cause: str) -> None:
     """A gross lie of an encoder leaves more than a small one, and a p can be found that explains it at this posture."""
     whole, tool = evidence(JOINT, LOAD), frozenset({LOAD})
 
