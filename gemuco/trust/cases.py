@@ -119,6 +119,21 @@ class Case:
         is_body = self.may_be_body and not any(self.cause.columns | columns <= part for part in parts)
         return is_body or self.cause.cause == "environment"
 
+    def crosses(self, parts: Iterable[Hidden], devices: Iterable[Hidden], sure: Hidden) -> bool:
+        """Whether it is several elements of a body whose parts can change, and not of one part or device.
+
+        A cut wire contradicts its neighbours too, which is likelier than two sensors that begin to lie at once.
+
+        Args:
+            parts: Columns of each part of the body with several sensors.
+            devices: Columns that one device measures.
+            sure: Columns that jumped lately or are stuck.
+        """
+        columns = self.cause.columns
+        is_one = any(columns <= whole for whole in (*parts, *devices, sure))
+        is_several = self.cause.cause == "all" and not self.cause.is_exchange
+        return is_several and not is_one and any(columns & part for part in parts)
+
     def is_bound(self, again: Cause, parts: Iterable[Hidden], beyond: Hidden) -> bool:
         """Whether an element of another part of the body must not replace it.
 

@@ -13,8 +13,8 @@ from gemuco.trust.jumps import TOGETHER
 
 TOOL, EXPLAINED = 0.85, 0.6
 """Without the wrong columns the evidence against all others is below the second share of an alarm; a contact of the
-body changes what is measured by many sensors, and more is left of it. Another tool, and what jumped or is stuck, is
-believed below the first."""
+body changes what is measured by many sensors, and more is left of it. Another tool, what jumped or is stuck, and what
+a part measures that may itself have changed are believed below the first."""
 CANDIDATES = 5
 """This many columns with the most evidence are held against each other."""
 BEHIND = 0.5
@@ -23,6 +23,8 @@ SEARCHED = 6
 """Partners are searched for this many columns with the most evidence."""
 PLAUSIBLE = 0.4
 """A column is a candidate from this share of an alarm on."""
+CONTRADICTED = 0.8
+"""All sensors of a part are contradicted if the evidence against each is at least this share of an alarm."""
 ALIKE = 6.0
 """Two columns look alike if their logarithms of the likelihood ratio differ by less than this."""
 CLOSE = 0.8
@@ -116,6 +118,8 @@ def explain(
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
     singles, others = _candidates(evidence, environment, signs)
+    accused = [part for part in parts if part.intersection(order[:3].tolist())]
+    likely = signs.sudden | _of_changed_parts(evidence, accused, signs.beyond)
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -125,7 +129,7 @@ def explain(
         return known[columns]
 
     def solves(columns: Hidden) -> bool:
-        return left(columns) < (TOOL if columns <= signs.sudden else EXPLAINED)
+        return left(columns) < (TOOL if columns <= likely else EXPLAINED)
 
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""
@@ -137,7 +141,6 @@ def explain(
     single = single or [column for column in others if solves(frozenset({column}))]
     twins = partial(_twins, without, are_twins)
     sudden = signs.sudden | frozenset(column for column in signs.alone if not twins(column, single))
-    accused = (part for part in parts if part.intersection(order[:3].tolist()))
     part = _changed_part(evidence, without, left, single, accused, signs.begun)
     for preferred in (sudden, signs.held, part):
         single = [column for column in single if column in preferred] or single
@@ -163,6 +166,15 @@ def explain(
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
+
+
+def _of_changed_parts(evidence: Evidence, accused: Sequence[Hidden], beyond: Hidden) -> Hidden:
+    """Return the columns of accused parts that may themselves have changed: a wire that was cut.
+
+    All sensors of such a part are contradicted, or one has left what was learned.
+    """
+    whole = [part for part in accused if len(part) > 1 and float(evidence.ratio[list(part)].min()) >= CONTRADICTED]
+    return frozenset().union(*whole, *(part & beyond for part in accused))
 
 
 def _twins(

@@ -156,8 +156,7 @@ class TrustMonitor:
     def trust(self, position: int) -> None:
         """Use an element again; it is not hidden again before it has agreed with the others once."""
         self._by_hand.pop(position, None)
-        cases = [case for case in self._cases if position in self._at(case)]
-        for case in cases:
+        for case in [case for case in self._cases if position in self._at(case)]:
             self._cases.remove(case)
             self._immune.update(self._at(case))
 
@@ -237,8 +236,7 @@ class TrustMonitor:
         elif is_alarm or (highest >= DOUBTFUL and is_due and bench.hides_another(ratio, hidden)):
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
-            highest = evidence.highest
-            for case in [c for c in self._cases if not c.is_hidden and c.has_lapsed(self._count, highest)]:
+            for case in [c for c in self._cases if not c.is_hidden and c.has_lapsed(self._count, evidence.highest)]:
                 self._close(case)
         if is_due:
             for case in [case for case in self._cases if case.is_hidden]:
@@ -324,9 +322,9 @@ class TrustMonitor:
         elements = frozenset().union(*(self._at(case) for case in together))
         if len(elements) <= AT_ONCE or any(elements <= device for device in self._devices):
             return
+        began = min(case.began for case in together)
         self._cases = [case for case in self._cases if case not in together]
-        body = Cause(frozenset(), "body", new.cause.lead)
-        self._cases.append(Case(body, min(case.began for case in together), self._count, self._count))
+        self._cases.append(Case(Cause(frozenset(), "body", new.cause.lead), began, self._count, self._count))
         self._immune.update(elements)
 
     def _refusal(self, case: Case, evidence: Evidence) -> str:
@@ -347,6 +345,8 @@ class TrustMonitor:
             return "the body was outside of what was learned"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
+        if case.crosses(self._parts, self._joined, bench.sudden(LATELY) | bench.recent.repeats.stuck):
+            return "a part of the body may have changed"
         return "" if self._replaces(self.hidden | elements) else "the model cannot replace it"
 
     def _judge_again(self, case: Case) -> None:
