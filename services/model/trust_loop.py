@@ -34,8 +34,8 @@ BEFORE = 1.0
 AWAY, BACK = 0.3, 2
 """An element that was away for the first time [s] is compared with the others for the second number of blocks before it
 is used again. The HAL, for example, takes a value that has jumped, and stays there, for five seconds only."""
-FAR = 5.0
-"""It stays hidden while it is further from its estimate than this [promised std]."""
+FAR = 3.0
+"""It stays hidden while it is further from its estimate than this [std that is promised for the estimate]."""
 WAITS = "distrusted: it is back, and not used before it agrees with its estimate"
 CAUSES = {
     "environment": "another tool or load than the model takes to be in use",
@@ -140,9 +140,8 @@ class Trust:
         hidden = np.where(self._returns.back, np.nan, values)
         hidden.setflags(write=False)
         completion = fill(schema, hidden, schema.derived(recipes)(np.isfinite(hidden)))
-        std = completion.std * np.maximum(1.0, self._factor())
         with np.errstate(invalid="ignore"):
-            return np.asarray(np.abs(values - completion.value) > FAR * std)
+            return np.asarray(np.abs(values - completion.value) > FAR * completion.std * self._factor())
 
     def trust(self, element: str) -> int:
         """Use an element again; it is not hidden again before it has agreed with the others once.

@@ -52,17 +52,18 @@ class Bench:
 
     def __init__(
         self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None, is_known: bool = True,
-        robot: RobotConfig | None = None,
+        robot: RobotConfig | None = None, factor: float = 1.0,
     ) -> None:  # fmt: skip
+        factors = np.full(model().layout.size, factor)
         self.clock, self.stops, self.changes = ManualClock(), list[str](), list[float]()
         self.newest: Arrival[Sample] | None = None
         self.freshness = Freshness(robot or arm(), lambda: self.newest, self.clock)
         self.trust = Trust(
             robot or arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
-            is_known=lambda schema: is_known, changed=self.changes.append, stops=stops,
+            is_known=lambda schema: is_known, changed=self.changes.append, stops=stops, factor=lambda: factors,
         )  # fmt: skip
         self.published: list[Estimates] = []
-        self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
+        self.estimation = Estimation(self.freshness, model, self.published.append, self.clock, lambda: factors)
         self.cycle = 0
 
     def feed(self, values: dict[str, np.ndarray], age: dict[str, float] | None = None) -> Estimates:
@@ -176,6 +177,26 @@ def test_an_element_that_returns_is_used_when_it_agrees(is_wrong: bool, is_known
     else:
         assert len(shown) >= 400 - 20  # within 0.4 s
         assert not bench.stops
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_an_element_that_returns_is_held_against_the_std_that_others_are_promised(factor: float) -> None:
+    place = arm().signals["joint_position"].elements.index("elbow_pitch")
+    is_used = {}
+    for errors in (1.5, 4.5):
+        bench, samples = Bench(factor=factor), motion(300, 4)
+        for sample in samples:
+            bench.feed(sample)
+        position = samples[-1]["joint_position"].copy()
+        position[place] = np.nan
+        for _ in range(30):
+            estimates = bench.feed(samples[-1] | {"joint_position": position})
+        assert estimates.estimated["joint_position"][place]
+        position[place] = estimates.values["joint_position"][place] + errors * estimates.std["joint_position"][place]
+        for _ in range(20):
+            estimates = bench.feed(samples[-1] | {"joint_position": position})
+        is_used[errors] = not estimates.estimated["joint_position"][place]
+    assert is_used == {1.5: True, 4.5: False}
 
 
 def test_elements_that_were_all_late_are_used_at_once() -> None:
