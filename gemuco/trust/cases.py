@@ -138,14 +138,17 @@ class Case:
         """Whether an element of another part of the body must not replace it.
 
         So it is if one of the sensors of its part jumped, or is beyond what was learned, or all are contradicted: a cut
-        wire lets the arm go where its neighbours look wrong.
+        wire lets the arm go where its neighbours look wrong. Neither may one of some that look alike, if another one of
+        them is beyond.
 
         Args:
             again: The element that explains best what is seen now.
             parts: Columns of each part of the body with several sensors.
             beyond: Columns outside of what was learned.
         """
-        whole = self._whole(parts)
+        whole, own = self._whole(parts), self.cause.columns & beyond
+        if again.columns < self.cause.columns:
+            return not again.columns & own and any(own & part for part in parts)
         return not again.columns <= whole and (self.is_plain or self.may_be_body or bool(whole & beyond))
 
     def _whole(self, parts: Iterable[Hidden]) -> Hidden:

@@ -137,15 +137,14 @@ def explain(
             if column not in environment and not signs.jumped and not solves(frozenset({column})):
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
-    single = [column for column in singles if solves(frozenset({column}))]
-    single = single or [column for column in others if solves(frozenset({column}))]
+    single = [c for c in singles if solves(frozenset({c}))] or [c for c in others if solves(frozenset({c}))]
     twins = partial(_twins, without, are_twins)
     sudden = signs.sudden | frozenset(column for column in signs.alone if not twins(column, single))
     part = _changed_part(evidence, without, left, single, accused, signs.begun)
     for preferred in (sudden, signs.held, part):
         single = [column for column in single if column in preferred] or single
     possible = single
-    single = [column for column in single if column in signs.beyond] or single
+    single = _beyond_first(single, signs.beyond, left, accused)
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)
     if pair and (not signs.jumped or pair <= signs.jumped):
@@ -175,6 +174,18 @@ def _of_changed_parts(evidence: Evidence, accused: Sequence[Hidden], beyond: Hid
     """
     whole = [part for part in accused if len(part) > 1 and float(evidence.ratio[list(part)].min()) >= CONTRADICTED]
     return frozenset().union(*whole, *(part & beyond for part in accused))
+
+
+def _beyond_first(
+    single: Sequence[int], beyond: Hidden, left: Callable[[Hidden], float], accused: Sequence[Hidden]
+) -> list[int]:
+    """Return the columns beyond what was learned, or all if none is.
+
+    One of a part that may itself have changed gives way to another one of it that explains the alarm like any element.
+    """
+    sure = frozenset(column for column in single if left(frozenset({column})) < EXPLAINED)
+    rest = [c for c in single if c in sure or not any(c in part and sure & part for part in accused)]
+    return [column for column in rest if column in beyond] or rest
 
 
 def _twins(

@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from gemuco.trust.changes import LONGEST
-from gemuco.trust.config import Hidden
+from gemuco.trust.config import BLOCK, Hidden
 
 EARLIER = 3
 """A change may have begun this number of blocks before it is dated."""
@@ -25,6 +25,8 @@ number of times that of all others. A knock at the body is a jump of more than t
 DRIFTED, RESTED = 3.0, 1.5
 """An element moved alone if it moved by at least the first number of healthy errors and as many times as far as all
 others, which moved by at most the second number of their own."""
+STALLED = 1.5 * BLOCK
+"""If the block before ended longer ago than this [s], what moves looks as if it had jumped since."""
 ONE_JUMP = 2
 """One jump is seen in at most this number of blocks."""
 WORTH, LEAST = 1.0, 0.1
@@ -71,9 +73,14 @@ class Jumps:
         self._recent: deque[np.ndarray] = deque(maxlen=LONGEST + EARLIER)
         self._usual, self._count = np.zeros(1), 0
 
-    def add(self, values: np.ndarray) -> None:
-        """Add the values of one block [standard deviations], shape (samples, elements), NaN where missing."""
-        if self._last is not None:
+    def add(self, values: np.ndarray, pause: float = BLOCK) -> None:
+        """Add the newest block.
+
+        Args:
+            values: Samples [standard deviations], shape (samples, elements), NaN where missing.
+            pause: Time since the block before [s].
+        """
+        if self._last is not None and pause <= STALLED:
             values = np.concatenate([self._last, values])
         bends = np.abs(np.diff(values, n=2, axis=0))
         self._recent.append(np.where(np.isfinite(bends), bends, 0.0).max(axis=0, initial=0.0))

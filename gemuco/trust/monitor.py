@@ -171,8 +171,8 @@ class TrustMonitor:
         if self._known is None or not len(samples):
             return
         bench = self._known
+        bench.recent.add(bench.schema, bench.relations, samples, now - self._now)
         self._count, self._now = self._count + 1, now
-        bench.recent.add(bench.schema, bench.relations, samples)
         motion = self._motion = bench.healthy.motion(bench.recent.moved())
         bench.recent.rest(motion, bench.healthy.looks)
         is_steady, self._missing = self._missing == bench.recent.missing(), bench.recent.missing()

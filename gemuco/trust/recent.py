@@ -10,7 +10,7 @@ import numpy as np
 from gemuco.schema import BodySchema
 from gemuco.trust.aligned import Shift, changes
 from gemuco.trust.changes import LONGEST
-from gemuco.trust.config import Hidden
+from gemuco.trust.config import BLOCK, Hidden
 from gemuco.trust.jumps import Jumps, Repeats
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
@@ -154,13 +154,20 @@ class Recent:
         self.resting = 0
         """This number of blocks ago the body had settled at its posture; 0 in motion."""
 
-    def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray) -> None:
-        """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
+    def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray, pause: float = BLOCK) -> None:
+        """Add the newest block.
+
+        Args:
+            schema: The schema.
+            relations: Its relations.
+            samples: Samples [standard deviations], shape (n, size), NaN where missing.
+            pause: Time since the block before [s].
+        """
         self._schema = schema
         rows = rows_of(schema, samples)[:, relations.columns]
         since = rows if self._last is None else np.concatenate([self._last, rows])
         self._samples, self._last = rows[:, : relations.count], rows[-1:]
-        self.jumps.add(self._samples)
+        self.jumps.add(self._samples, pause)
         finite = np.isfinite(rows)
         missing = finite.sum(axis=0) * 2 < len(rows)
         whole = rows[finite[:, ~missing].all(axis=1)]

@@ -44,6 +44,18 @@ def test_a_tension_beyond_what_was_learned_is_believed_to_be_the_cause_although_
     assert explain(whole, without, (), (MUSCLE,), frozenset(), Signs(beyond=frozenset(beyond))).columns == columns
 
 
+def test_a_tension_beyond_what_was_learned_gives_way_to_the_length_if_that_explains_the_alarm_better() -> None:
+    whole = evidence(joint=50.0, tension=90.0, length=120.0)
+    for share, columns in ((0.4, {LENGTH}), (0.9, {TENSION})):
+
+        def without(hidden: frozenset[int], share: float = share) -> Evidence:
+            rest = 0.7 if TENSION in hidden else share if LENGTH in hidden else 1.1
+            return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, rest, 0.0))
+
+        result = explain(whole, without, (), (MUSCLE,), frozenset(), Signs(beyond=frozenset({TENSION})))
+        assert result.columns == columns
+
+
 @pytest.mark.parametrize(
     ("tension", "left", "columns"),
     [(70.0, 0.8, {LENGTH}), (50.0, 0.8, {JOINT, LENGTH}), (70.0, 0.9, {JOINT, LENGTH})],
@@ -83,3 +95,14 @@ def test_sensors_of_different_parts_are_not_hidden_together_unless_all_are_sure_
     assert case.crosses([MUSCLE, NEXT], [frozenset({JOINT, 1, 2})], frozenset(sure)) == crosses
     exchanged = replace(case, cause=Cause(frozenset({JOINT, LENGTH}), "all", JOINT, is_exchange=True))
     assert not exchanged.crosses([MUSCLE, NEXT], [], frozenset())
+
+
+@pytest.mark.parametrize(
+    ("beyond", "again", "is_bound"),
+    [({TENSION}, JOINT, True), ({TENSION}, TENSION, False), ({JOINT}, TENSION, False), (set(), JOINT, False)],
+)
+def test_of_two_that_look_alike_the_one_beyond_what_was_learned_is_not_used_again(
+    beyond: set[int], again: int, is_bound: bool
+) -> None:
+    case = Case(Cause(frozenset({TENSION, JOINT}), "either", TENSION), 1, 1, 1)
+    assert case.is_bound(Cause(frozenset({again}), "element", again), [MUSCLE], frozenset(beyond)) == is_bound

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gemuco.trust.changes import LONGEST
+from gemuco.trust.config import BLOCK
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.healthy import DOUBTED, PRIOR, Healthy
 from gemuco.trust.hypotheses import Signs, explain
@@ -42,6 +43,18 @@ def test_the_one_that_jumped_is_named_whenever_within_a_block_it_did() -> None:
         samples[LEARNED + 13 :, :, JOINT] += 0.5
         assert after(samples).sudden(3, ERROR) == {JOINT}
         assert not after(samples[: LEARNED + 12]).sudden(3, ERROR)
+
+
+def test_what_moved_while_samples_were_missing_has_not_jumped() -> None:
+    samples = motion(LEARNED + 15)
+    samples[LEARNED + 12 :, :, JOINT] += 0.5
+    named = {}
+    for pause in (1.2 * BLOCK, 5.0 * BLOCK):
+        jumps = after(samples[: LEARNED + 12])
+        jumps.add(samples[LEARNED + 12], pause)
+        jumps.add(samples[LEARNED + 13])
+        named[pause] = jumps.sudden(3, ERROR)
+    assert list(named.values()) == [{JOINT}, frozenset()]
 
 
 @pytest.mark.parametrize(
