@@ -25,8 +25,9 @@ number of times that of all others. A knock at the body is a jump of more than t
 DRIFTED, RESTED = 3.0, 1.5
 """An element moved alone if it moved by at least the first number of healthy errors and as many times as far as all
 others, which moved by at most the second number of their own."""
-STALLED = 1.5 * BLOCK
-"""If the block before ended longer ago than this [s], what moves looks as if it had jumped since."""
+STALLED, PAUSES = 1.5, 20
+"""If the block before ended longer ago than the first multiple of the shortest of the second number of pauses, or of
+`BLOCK`, what moves looks as if it had jumped since."""
 ONE_JUMP = 2
 """One jump is seen in at most this number of blocks."""
 WORTH, LEAST = 1.0, 0.1
@@ -72,6 +73,7 @@ class Jumps:
         self._last: np.ndarray | None = None
         self._recent: deque[np.ndarray] = deque(maxlen=LONGEST + EARLIER)
         self._usual, self._count = np.zeros(1), 0
+        self._pauses = deque([BLOCK], maxlen=PAUSES)
 
     def add(self, values: np.ndarray, pause: float = BLOCK) -> None:
         """Add the newest block.
@@ -80,8 +82,9 @@ class Jumps:
             values: Samples [standard deviations], shape (samples, elements), NaN where missing.
             pause: Time since the block before [s].
         """
-        if self._last is not None and pause <= STALLED:
+        if self._last is not None and pause <= STALLED * max(BLOCK, min(self._pauses)):
             values = np.concatenate([self._last, values])
+        self._pauses.append(pause)
         bends = np.abs(np.diff(values, n=2, axis=0))
         self._recent.append(np.where(np.isfinite(bends), bends, 0.0).max(axis=0, initial=0.0))
         self._last = values[-2:]

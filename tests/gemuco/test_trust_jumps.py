@@ -45,16 +45,24 @@ def test_the_one_that_jumped_is_named_whenever_within_a_block_it_did() -> None:
         assert not after(samples[: LEARNED + 12]).sudden(3, ERROR)
 
 
-def test_what_moved_while_samples_were_missing_has_not_jumped() -> None:
-    samples = motion(LEARNED + 15)
+@pytest.mark.parametrize(
+    ("usual", "pause", "named"),
+    [
+        (BLOCK, 1.3 * BLOCK, {JOINT}),
+        (BLOCK, 2.0 * BLOCK, set()),
+        (3.0 * BLOCK, 4.0 * BLOCK, {JOINT}),
+        (0.1 * BLOCK, BLOCK, {JOINT}),
+    ],
+    ids=["a tick was late", "the machine stalled", "samples are rare", "the ticks before were late"],
+)
+def test_what_moved_while_samples_were_missing_has_not_jumped(usual: float, pause: float, named: set[int]) -> None:
+    samples, jumps = motion(LEARNED + 15), Jumps()
     samples[LEARNED + 12 :, :, JOINT] += 0.5
-    named = {}
-    for pause in (1.2 * BLOCK, 5.0 * BLOCK):
-        jumps = after(samples[: LEARNED + 12])
-        jumps.add(samples[LEARNED + 12], pause)
-        jumps.add(samples[LEARNED + 13])
-        named[pause] = jumps.sudden(3, ERROR)
-    assert list(named.values()) == [{JOINT}, frozenset()]
+    for number, block in enumerate(samples[: LEARNED + 14]):
+        jumps.add(block, pause if number == LEARNED + 12 else usual)
+        if number < LEARNED + 10:
+            jumps.learn(frozenset())
+    assert jumps.sudden(3, ERROR) == named
 
 
 @pytest.mark.parametrize(
