@@ -138,8 +138,8 @@ class Case:
         """Whether an element of another part of the body must not replace it.
 
         So it is if one of the sensors of its part jumped, or is beyond what was learned, or all are contradicted: a cut
-        wire lets the arm go where its neighbours look wrong. Neither may one of some that look alike, if another one of
-        them is beyond.
+        wire lets the arm go where its neighbours look wrong. Nor may one of some that look alike replace all of them
+        while another one is beyond.
 
         Args:
             again: The element that explains best what is seen now.

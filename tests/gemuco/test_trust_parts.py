@@ -4,21 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from muscle_evidence import JOINT, LENGTH, MUSCLE, OTHER, SIZE, TENSION, evidence
 
 from gemuco.trust.cases import Case
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import Cause, Signs, explain, remaining
-
-SIZE, JOINT, TENSION, LENGTH, OTHER = 12, 0, 3, 8, 9
-MUSCLE = frozenset({TENSION, LENGTH})
-
-
-def evidence(**strength: float) -> Evidence:
-    """Return evidence against joint, tension and length; the joint alarms."""
-    columns = {"joint": JOINT, "tension": TENSION, "length": LENGTH}
-    against, zero = np.zeros(SIZE), np.zeros(SIZE, bool)
-    against[[columns[name] for name in strength]] = list(strength.values())
-    return Evidence(against / 80.0, against, np.full(SIZE, 5), np.zeros(SIZE), zero, zero, 1.0)
 
 
 @pytest.mark.parametrize(
