@@ -26,7 +26,7 @@ from services.demo.page import playing_along
 from services.demo.report import CLIENT, Ending
 from services.demo.stories.choice import story_of
 from services.demo.stories.scene import Scene
-from services.errors import AlreadyRunning, ServiceUnavailable
+from services.errors import AlreadyRunning, ServiceError, ServiceUnavailable
 from services.extras import engine_of, require
 from services.learning import collector, trainer
 from services.model import artifacts
@@ -65,13 +65,15 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
             warm(advance, has_p=trainer.has_p(robot))
         with Supervisor(out, at_checks=True) as supervisor:
             with running(robot, path, seed, out, supervisor, console, with_page) as cast:
-                perform(cast, seed, picture, list(supervisor.children), link)
+                try:
+                    perform(cast, seed, picture, list(supervisor.children), link)
+                except ServiceError:
+                    report.show(ending_of(cast, robot), console)  # the stages so far
+                    raise
             supervisor.stop("client", "recorder")
-            cast.remote.print_new()
-    actor, remote = cast.actor, cast.remote
-    rates = cast.robot.rates.hal, robot.rates.hal
-    ending = Ending(robot.robot, actor.played, actor.stops, remote.lines, remote.estimated, *rates)
-    report.show(ending, out, console)
+    ending = ending_of(cast, robot)
+    report.show(ending, console)
+    report.show_files(out, console)
     report.write(ending, path, seed, picture)
     if ending.rate != ending.wanted:
         console.print(f"Played at {ending.rate:g} Hz, because {ending.wanted:g} Hz are too much for this machine.")
@@ -96,6 +98,14 @@ class Cast:
     actor: Actor
     remote: "RemoteClient"
     screen: Screen
+
+
+def ending_of(cast: Cast, robot: RobotConfig) -> Ending:
+    """Return the results of the stages that were played; `robot` has the rates of the robot file."""
+    actor, remote = cast.actor, cast.remote
+    remote.print_new()
+    rates = cast.robot.rates.hal, robot.rates.hal
+    return Ending(robot.robot, actor.played, actor.stops, remote.lines, remote.estimated, *rates)
 
 
 @contextmanager

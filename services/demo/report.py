@@ -74,8 +74,8 @@ class Ending:
         return f"{self.lines} estimates printed by a separate process, {self.estimated} of them not measured"
 
 
-def show(ending: Ending, out: Path, console: Console) -> None:
-    """Print a table of the stages, and the files."""
+def show(ending: Ending, console: Console) -> None:
+    """Print a table of the stages."""
     table = Table(title="What happened", title_justify="left", show_lines=True)
     table.add_column("stage")
     table.add_column("measured")
@@ -86,6 +86,10 @@ def show(ending: Ending, out: Path, console: Console) -> None:
     console.print(table)
     if ending.stops:
         console.print(f"The HAL stopped the arm {ending.stops} times by itself, see above.")
+
+
+def show_files(out: Path, console: Console) -> None:
+    """Print which files a play has made."""
     console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
     console.print(f"Report, one file to send: {out / 'report.html'}")
 

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from hal.config import RobotConfig, load_robot
 from services.demo import demo, pace
-from services.demo.actor import Actor, NotFollowing
+from services.demo.actor import Actor, NotFollowing, Stage
 from services.demo.pace import CycleCounts, at_rates, count_cycles, halved
 from services.errors import ServiceError, ServiceUnavailable
 from services.model.artifacts import fingerprint
@@ -221,6 +221,26 @@ def test_an_arm_that_follows_at_no_rate_ends_the_demo(monkeypatch: pytest.Monkey
     ):
         raise AssertionError("the story is not played")
     assert processes.rates == [200, 100, 50]
+
+
+def test_a_story_that_ends_early_shows_the_stages_before(
+    monkeypatch: pytest.MonkeyPatch, arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stall(cast: demo.Cast, *_: object) -> None:
+        cast.actor.played.append(Stage("loses an encoder", 0.0, 4.0, ("0.09 rad wrong",), True))
+        raise NotFollowing("The arm did not begin to follow.")
+
+    Processes(monkeypatch, 200)
+    monkeypatch.setattr(demo, "check_start", lambda *_: None)
+    monkeypatch.setattr(demo, "make_model", lambda *_: None)
+    monkeypatch.setattr(demo, "warm", lambda *_, has_p: None)
+    monkeypatch.setattr(demo, "perform", stall)
+    with pytest.raises(NotFollowing):
+        demo.play(load_robot(arm), arm, 1, arm.parent / "out")
+    shown = capsys.readouterr().out
+    assert "loses an encoder" in shown
+    assert "0.09 rad wrong" in shown
+    assert "story.png" not in shown  # it was not drawn
 
 
 @pytest.mark.parametrize("has_ended", [True, False])
