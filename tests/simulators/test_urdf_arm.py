@@ -111,6 +111,18 @@ def test_what_is_no_arm_is_refused_in_a_sentence(tmp_path, text, report):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("arm", "hint"),
+    [("", "No other end has an arm before it."), (joint("lift", "revolute", "a", "hand"), "by --tip: hand.")],
+)
+def test_a_wheel_is_not_named_in_place_of_another_wheel(tmp_path, arm, hint):
+    wheels = "".join(link(name) + joint(name, "continuous", "a", name) for name in ("left", "right"))
+    text = f"<robot>{link('a')}{wheels}{link('hand', mass=1.0) + arm if arm else ''}</robot>"
+    with pytest.raises(ConfigError) as caught:
+        choose_arm(read_tree(written(tmp_path, text)), "left")
+    assert str(caught.value).endswith(hint)
+
+
 @pytest.mark.parametrize("declared", ["", "xmlns:drake='http://drake.mit.edu'"])
 def test_extensions_of_other_programs_are_left_out(tmp_path, declared):
     """Files do not declare their prefix; an empty line before the XML declaration is usual too. ROS reads both."""

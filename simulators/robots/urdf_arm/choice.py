@@ -127,10 +127,11 @@ def choose_arm(tree: Tree, tip: str | None = None) -> Arm:
         )
     arm = Arm(tree, joints, chosen, tuple(_notes(tree, joints, chosen, [] if tip else list(chains)[1:])))
     if arm.reach < SHORTEST:
-        others = ", ".join(end for end in chains if end != chosen) or "there is none"
+        others = [end for end in chains if end != chosen and Arm(tree, _driven(tree, end), end).reach >= SHORTEST]
+        hint = f"Name another end by --tip: {', '.join(others)}." if others else "No other end has an arm before it."
         raise ConfigError(
-            f"'{chosen}' of '{tree.path}' turns in place, so no camera can see how its joints move it. "
-            f"Name another end by --tip: {others}."
+            f"'{chosen}' of '{tree.path}' turns in place, as wheels do, so no camera can see how its joints move it. "
+            f"{hint}"
         )
     return arm
 
