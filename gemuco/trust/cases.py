@@ -38,6 +38,11 @@ CONSTANT = 0.35
 """The error of an offset varies by less than this share of it."""
 BETTER = 0.5
 """A kind with one more number must leave less than this share of the squared error."""
+PATIENCE = 100
+"""An element that jumped away returns after this number of blocks, or after it has jumped back."""
+SHOWN = 5.0
+"""Where a part of the body may have changed instead, an element is hidden after this number of blocks of motion: one
+posture shows both alike."""
 
 
 @dataclass(slots=True)
@@ -52,7 +57,7 @@ class Case:
         seen: Number of blocks that were explained by it.
         weight: Their evidence, the sum of squared shares of an alarm.
         steps: Their largest results of the step test [standard deviations], shape (columns,).
-        moved: Their motion [blocks at the usual pace].
+        moved: Motion in these blocks, and in all since it is hidden [blocks at the usual pace].
         is_hidden: Whether its elements are hidden.
         has_jumped: Whether an element has jumped away, and not yet back.
         jumped_alone: Whether it is one element that is wrong by as much as it jumped, so the body did not move with it.
@@ -102,6 +107,15 @@ class Case:
         self.may_be_body |= is_body and not is_sensor
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
+
+    def has_shown(self, cause: Cause) -> bool:
+        """Whether the body moved enough to know an element from a part of the body that may have changed instead."""
+        return self.moved >= SHOWN or not cause.is_contested
+
+    def waits(self, now: int) -> bool:
+        """Whether it is not used again yet: exchanged ones agree where they cross, one that jumped away by chance."""
+        exchanged, jumped = LONGEST * self.cause.is_exchange, PATIENCE * self.has_jumped
+        return now - self.first < max(exchanged, jumped)
 
     def has_lapsed(self, now: int, highest: float) -> bool:
         """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""

@@ -1,10 +1,12 @@
 """Settings of the trust in sensors, and what is found."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 Hidden = frozenset[int]
 """Judged columns that are not used: elements, then p, by their number in `Relations.columns`."""
+Replaces = Callable[[frozenset[int]], bool]
+"""Whether all elements of a set can be estimated while none of them is measured."""
 
 BLOCK = 0.1
 """Samples are judged in blocks of this length [s]."""

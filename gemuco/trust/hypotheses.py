@@ -48,6 +48,8 @@ class Cause:
         lead: The column with the most evidence.
         condition: The trained condition whose p explains the alarm; empty if none does.
         is_exchange: Whether they are two elements that agree with all others in each other's place.
+        is_contested: Whether a part of the body with several sensors may have changed instead: without all of these the
+            alarm would be gone as well.
     """
 
     columns: Hidden
@@ -55,6 +57,7 @@ class Cause:
     lead: int
     condition: str = ""
     is_exchange: bool = False
+    is_contested: bool = False
 
     @property
     def is_element(self) -> bool:
@@ -68,6 +71,8 @@ class Signs:
 
     Attributes:
         sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
+        first: Columns that jumped alone in the first block of the alarm that lasts. What jumps after it, or contradicts
+            the others more, may only follow: an arm falls when a wire is cut.
         jumped: All columns that jumped when the alarm began. What did not jump contradicts them from then on, but has
             not begun to lie.
         held: The column that holds its value while all others move, if one does.
@@ -79,6 +84,7 @@ class Signs:
     """
 
     sudden: Hidden = frozenset()
+    first: Hidden = frozenset()
     jumped: Hidden = frozenset()
     held: Hidden = frozenset()
     alone: Hidden = frozenset()
@@ -119,7 +125,7 @@ def explain(
     lead = int(order[0])
     singles, others = _candidates(evidence, environment, signs)
     accused = [part for part in parts if part.intersection(order[:3].tolist())]
-    likely = signs.sudden | _of_changed_parts(evidence, accused, signs.beyond)
+    likely = signs.sudden | signs.first | _of_changed_parts(evidence, accused, signs.beyond)
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -141,7 +147,7 @@ def explain(
     twins = partial(_twins, without, are_twins)
     sudden = signs.sudden | frozenset(column for column in signs.alone if not twins(column, single))
     part = _changed_part(evidence, without, left, single, accused, signs.begun)
-    for preferred in (sudden, signs.held, part):
+    for preferred in (signs.first, sudden, signs.held, part):
         single = [column for column in single if column in preferred] or single
     possible = single
     single = _beyond_first(single, signs.beyond, left, accused)
@@ -160,11 +166,18 @@ def explain(
     if single:
         alike = [c for c in single if _is_alike(*evidence.strength[[single[0], c]].tolist())]
         alike = list(dict.fromkeys([*alike, *twins(alike[0], possible)]))[:MOST]
-        return Cause(frozenset(alike), "element" if len(alike) == 1 else "either", alike[0])
+        return _named(alike, left, accused)
     for columns, cause in _sets(singles, devices, parts, partners, signs.jumped):
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
+
+
+def _named(alike: Sequence[int], left: Callable[[Hidden], float], accused: Sequence[Hidden]) -> Cause:
+    """Return the elements that explain an alarm, the most likely first, as its cause."""
+    others = [part for part in accused if len(part) > 1 and not part.intersection(alike)]
+    is_contested = any(left(part) < TOOL for part in others)
+    return Cause(frozenset(alike), "element" if len(alike) == 1 else "either", alike[0], is_contested=is_contested)
 
 
 def _of_changed_parts(evidence: Evidence, accused: Sequence[Hidden], beyond: Hidden) -> Hidden:

@@ -1,6 +1,6 @@
 """The monitor: it judges every element block by block, and hides those that lie until they have agreed again."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +9,7 @@ from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.bench import DOUBTFUL, LATELY, Bench
 from gemuco.trust.cases import Case, LastSearch, describe, has_agreed, has_moved
-from gemuco.trust.changes import LONGEST
-from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
+from gemuco.trust.config import BLOCK, Finding, Hidden, Replaces, TrustConfig
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import RIVALS, Cause, Signs, explain, remaining
 from gemuco.trust.jumps import TOGETHER
@@ -59,10 +58,6 @@ BESIDE = 2.0
 """While an element is hidden, less is known of what is healthy: an alarm needs this multiple of the evidence."""
 ACQUAINTED = 60.0
 """A body on which nothing was contradicted for this number of blocks of motion is known, whatever its scores are."""
-PATIENCE = 100
-"""An element that jumped away returns after this number of blocks, or after it has jumped back."""
-Replaces = Callable[[frozenset[int]], bool]
-"""Whether all elements of a set can be estimated while none of them is measured."""
 
 
 class TrustMonitor:
@@ -111,6 +106,8 @@ class TrustMonitor:
         self._search, self._missing = LastSearch(), Hidden()
         self._jumped: Hidden | None = None
         """The columns that jumped when the alarm that lasts began, and since, if any did; None without an alarm."""
+        self._first: Hidden = frozenset()
+        """Those of them that jumped alone in its first block."""
         place, movable = bench.place, [int(p) for p in relations.columns[: relations.count]]
         self._parts = [frozenset(place[p] for p in part) for part in parts(schema, movable)]
         self._joined = [frozenset(place[p] for p in device if p in place) for device in self._devices]
@@ -220,9 +217,10 @@ class TrustMonitor:
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         if highest < CALM and not any(case.cause.cause == "environment" for case in self._cases):
-            self._jumped = None
+            self._jumped, self._first = None, frozenset()
         elif highest >= 1.0 and self._jumped is None:
             self._jumped = bench.began_with(evidence) - hidden
+            self._first = self._jumped & bench.sudden(LATELY)
         elif self._jumped:
             self._jumped |= bench.jumped(1) - hidden  # another lie may begin
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
@@ -238,8 +236,9 @@ class TrustMonitor:
         else:
             for case in [c for c in self._cases if not c.is_hidden and c.has_lapsed(self._count, evidence.highest)]:
                 self._close(case)
-        if is_due:
-            for case in [case for case in self._cases if case.is_hidden]:
+        for case in [case for case in self._cases if case.is_hidden]:
+            case.moved += self._motion
+            if is_due:
                 self._judge_again(case)
         if immune and is_due and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
@@ -265,7 +264,8 @@ class TrustMonitor:
         elements, others = self._at(replace(case, cause=cause)), self.hidden - self._at(case)
         is_sensor = not cause.columns & self._bench.environment
         is_used = cause.cause == "either" and self._config.pairs == "use"
-        return is_sensor and not is_used and not self._immune & elements and self._replaces(others | elements)
+        is_possible = is_sensor and not is_used and not self._immune & elements and case.has_shown(cause)
+        return is_possible and self._replaces(others | elements)
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -298,8 +298,9 @@ class TrustMonitor:
             began = self._count - int(evidence.age[cause.lead]) + 1
             known = Case(cause, began, self._count, self._count)
             self._cases.append(known)
-        known.weigh(evidence, bench.sudden(LATELY), bench.recent.repeats.stuck, self._parts)
-        is_enough = known.is_plain or known.weight >= bench.healthy.caution or cause.cause == "environment"
+        known.weigh(evidence, bench.sudden(LATELY) | self._first, bench.recent.repeats.stuck, self._parts)
+        has_weight = known.weight >= bench.healthy.caution and known.has_shown(cause)
+        is_enough = known.is_plain or has_weight or cause.cause == "environment"
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
             self._release_recent()
@@ -363,12 +364,8 @@ class TrustMonitor:
         if not columns:
             return
         if evidence.highest < CALM:
-            if case.cause.is_exchange and self._count - case.first < LONGEST:
-                return  # where the two cross they seem to agree
-            if case.cause.columns & bench.recent.repeats.stuck:
+            if case.waits(self._count) or case.cause.columns & bench.recent.repeats.stuck:
                 return  # it agrees by chance
-            if case.has_jumped and self._count - case.first < PATIENCE:
-                return  # it jumped away, and has not jumped back
             if bench.recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * bench.judge.scale):
                 return
             agrees = has_agreed(shown.standard(bench.judge.scale)[:, columns], bench.judge.least[columns])
@@ -420,8 +417,9 @@ class TrustMonitor:
         bench, age = self._bench, evidence.newest
         parts, begun = remaining(self._parts, hidden, self._hidden_by_cases() & hidden)
         signs = Signs(
-            (bench.sudden(age) | bench.recent.repeats.stuck) - hidden, self._jumped or frozenset(),
-            bench.recent.repeats.held - hidden, bench.moved_alone(age) - hidden, bench.beyond, begun,
+            (bench.sudden(age) | bench.recent.repeats.stuck) - hidden, self._first - hidden,
+            self._jumped or frozenset(), bench.recent.repeats.held - hidden, bench.moved_alone(age) - hidden,
+            bench.beyond, begun,
         )  # fmt: skip
         return explain(
             evidence, bench.without(hidden, age), self._joined, parts,
@@ -431,9 +429,8 @@ class TrustMonitor:
         )  # fmt: skip
 
     def _hidden_columns(self) -> Hidden:
-        bench = self._bench
-        by_hand = {bench.place[p] for p in self._by_hand if p in bench.place}
-        return self._hidden_by_cases() | by_hand
+        place = self._bench.place
+        return self._hidden_by_cases() | {place[p] for p in self._by_hand if p in place}
 
     def _hidden_by_cases(self) -> Hidden:
         return frozenset().union(*(case.cause.columns for case in self._cases if case.is_hidden))
