@@ -18,6 +18,8 @@ from services.demo.stories.muscle_story import (
     CALM_TRIES,
     LEARNED,
     LEARNING_POSES,
+    LOADED,
+    LOADING_POSES,
     MOST_POSES,
     NORMAL,
     POSE_TIME,
@@ -50,7 +52,7 @@ class Machine:
         self.normals.append(self.window)
         return {"samples": self.window}
 
-    def go(self, signal: str, pose: np.ndarray, duration: float) -> None:
+    def go(self, signal: str, pose: np.ndarray, duration: float, ends: object = None) -> None:
         self.poses += 1
         self.window += self.per_pose
 
@@ -89,6 +91,17 @@ def test_what_is_normal_is_learned_from_more_until_the_whole_arm_is_calm(alarms:
     assert machine.normals == sorted(machine.normals)
     assert machine.poses == learned * LEARNING_POSES
     assert sum("An anomaly is reported for the whole arm" in sentence for sentence in machine.said) == learned
+
+
+@pytest.mark.parametrize(("tensions", "poses"), [([25.0], 0), ([19.9, LOADED], 1), ([0.0] * 9, LOADING_POSES)])
+def test_a_wire_is_cut_where_it_bears_something(
+    monkeypatch: pytest.MonkeyPatch, tensions: list[float], poses: int
+) -> None:
+    machine, is_cut = Machine(0), np.array(ROBOT.signals["muscle_tension"].elements) == "deltoid_side"
+    forces = {"muscle_tension": lambda: np.where(is_cut, tensions[machine.poses], 99.0)}
+    monkeypatch.setattr(machine, "truth", lambda signal: forces[signal](), raising=False)
+    machine.story()._load_muscle()
+    assert machine.poses == poses
 
 
 class Lie(Machine):

@@ -40,10 +40,13 @@ CALM_TRIES = 3
 """The statistics of normal errors are learned at most this often, each time from more poses."""
 SILENT_POSES = 2
 CUT_POSES = 3
+LOADED, LOADING_POSES = 20.0, 6
+"""The muscle is cut where it bears the first number [N], if it does in one of the second number of poses: the cut of a
+slack wire changes nothing that could be noticed."""
 INSIDE = 0.15
 """The distance of targets from the limits is at least this share of the range."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
-MUSCLE = "deltoid_side"
+MUSCLE, TENSION = "deltoid_side", "muscle_tension"
 LIES = (("elbow_pitch", "sensor_offset elbow_pitch_encoder 1.0", "one radian off"),
         ("shoulder_pitch", "sensor_frozen shoulder_pitch_encoder", "frozen"))  # fmt: skip
 """Elements whose encoders lie, the faults, and the lies in words."""
@@ -71,8 +74,9 @@ class Marks:
 
 
 def fits(robot: RobotConfig, control: ControlConfig | None) -> bool:
-    """Whether the robot has the muscle that is cut."""
-    return control is not None and MUSCLE in robot.signals[robot.command.signal].elements
+    """Whether the robot has the muscle that is cut, and measures its tension."""
+    is_measured = TENSION in robot.signals and MUSCLE in robot.signals[TENSION].elements
+    return control is not None and is_measured and MUSCLE in robot.signals[robot.command.signal].elements
 
 
 class MuscleStory:
@@ -88,6 +92,7 @@ class MuscleStory:
         self._elements = robot.signals[self._signal].elements
         self._muscles = robot.signals[robot.command.signal].elements
         self._muscle_signals = {name for name, signal in robot.signals.items() if signal.elements == self._muscles}
+        self._loaded = robot.signals[TENSION].elements.index(MUSCLE)
         self._low, self._high = robot.bounds(self._signal)
         self._random = np.random.default_rng(seed)
         self._poses = [self._pose() for _ in range(POSES)]
@@ -218,8 +223,10 @@ class MuscleStory:
 
     def lose_muscle(self) -> Stage:
         """Play (e): a muscle is cut, and the anomaly detection names it, or an element of it is distrusted."""
+        self._load_muscle()
         self._become_calm()
-        self._report(f"[bold](e)[/] The wire of {MUSCLE} is cut.")
+        tension = self._tension()
+        self._report(f"[bold](e)[/] The wire of {MUSCLE}, which bears {tension:.0f} N, is cut.")
         start = self._timeline.now()
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
@@ -242,6 +249,7 @@ class MuscleStory:
         peak = float(np.nanmax(self._timeline.between("score", start, self.marks.alarm + 1.0)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
+            f"the wire bore {tension:.0f} N",
             f"anomaly score {score:.1f} before the cut, then up to {peak:.1f}, threshold {limit:.1f}",
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms by {' and '.join(by) or 'nothing'}",
             *self._blame(early),
@@ -251,6 +259,17 @@ class MuscleStory:
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
         return Stage(NAMES[4], start, end, figures, noticed and right and not calm.any())
+
+    def _load_muscle(self) -> None:
+        """Go to poses until the muscle bears something."""
+        for _ in range(LOADING_POSES):
+            if self._tension() >= LOADED:
+                return
+            self._actor.go(self._signal, self._pose(), POSE_TIME, ends=self._at_rest)
+
+    def _tension(self) -> float:
+        """Return the true tension of the muscle now [N]."""
+        return float(self._actor.truth(TENSION)[self._loaded])
 
     def _is_cut_noticed(self) -> bool:
         return self._is_alarmed() or bool(self._distrusted_of_muscle())
