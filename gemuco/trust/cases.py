@@ -113,7 +113,10 @@ class Case:
         return self.moved >= SHOWN or not cause.is_contested
 
     def waits(self, now: int) -> bool:
-        """Whether it is not used again yet: exchanged ones agree where they cross, one that jumped away by chance."""
+        """Whether it is too early to use it again, although it agrees.
+
+        Exchanged elements seem to agree where the two cross; one that jumped away has not jumped back.
+        """
         exchanged, jumped = LONGEST * self.cause.is_exchange, PATIENCE * self.has_jumped
         return now - self.first < max(exchanged, jumped)
 

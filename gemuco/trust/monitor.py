@@ -207,6 +207,8 @@ class TrustMonitor:
     def _decide(self, evidence: Evidence, hidden: Hidden, is_steady: bool) -> None:
         """Suspect, hide and show elements; `is_steady` says whether the same were missing in the block before."""
         bench = self._bench
+        for case in [case for case in self._cases if case.is_hidden]:
+            case.moved += self._motion
         immune = [bench.place[p] for p in self._immune if p in bench.place]
         ratio = self._left(evidence, hidden)
         if any(case.is_hidden for case in self._cases):
@@ -236,9 +238,8 @@ class TrustMonitor:
         else:
             for case in [c for c in self._cases if not c.is_hidden and c.has_lapsed(self._count, evidence.highest)]:
                 self._close(case)
-        for case in [case for case in self._cases if case.is_hidden]:
-            case.moved += self._motion
-            if is_due:
+        if is_due:
+            for case in [case for case in self._cases if case.is_hidden]:
                 self._judge_again(case)
         if immune and is_due and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
